@@ -1,0 +1,1 @@
+"""The characters: NAME.xml (MJCF), NAME.toml (tables) and the trained NAME.npz, as package data."""

@@ -1,0 +1,395 @@
+r"""The environment: N characters, each driven by a headset and two controllers  [Reda23 §3.3, §3.5, §3.6].
+
+    action ──► torque ──► MuJoCo (its own thread pool, 4 × 1/120 s) ──► refresh ──► reward, termination ──► observation
+
+    observe      Eqs. 2 to 4      what the actor sees: character and sensors, in the heading frame
+    privileged   §3.3             what only the critic sees: the human's full pose, now and in the future
+    reward_*     Eqs. 5 to 11     one pure function a term; Table 2's weights come from characters/NAME.toml
+    Env          §3.6, §3.7       reset and step as Gymnasium's vector environments have them
+
+After a physics step MuJoCo's positions, velocities and contacts still belong to the state before the last substep;
+`Batch.step(stage=VEL)` recomputes them at the new state (design.md, mistake 4).
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from mocap import CONTROL_RATE, heading, quat_angle
+from retarget import STAGE_VEL, TERMS, Character, Reference, body_velocity, geom_lowest
+from runs import rng_from_state, rng_state
+
+ROOT_LIMIT = 0.30  # m  [Reda23 §3.6]; ASSUMED in 3-D
+FORCE_LIMIT = 1.0  # N  [Reda23 App. A]
+EPISODE_STEPS = 500  # [Reda23 §3.6]
+SUBSTEPS = 4  # ASSUMED: 1/120 s physics at 30 Hz control (feasibility: 1/60 s does not learn)
+FUTURES = (1, 5, 15)  # ASSUMED: future frames shown to the critic, in control steps
+BAD = [int(w) for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)]
+USER_SIZE = 3 * (3 + 6)
+
+# ------------------------------------------------------------------------------------ observation
+
+
+class HeadingFrame:
+    r"""The frame of every observation: on the floor below the root, turned with the root's heading  [Reda23 §3.3].
+
+    Equation  p' = R_z(−ψ) (p − (x_root, y_root, 0)),  R' = R_z(−ψ) R
+    Args      root_pos (N, 3), root_quat (N, 4), world
+    Test      tests/test_env.py::test_heading_invariance
+    """
+
+    def __init__(self, root_pos, root_quat):
+        yaw = heading(root_quat)
+        self.c, self.s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]  # (N, 1)
+        self.origin = root_pos.copy()
+        self.origin[:, 2] = 0.0
+
+    def turn(self, v, out):
+        """Rotate vectors (N, P, 3), or the columns of matrices (N, P, 3, 2), into the frame."""
+        c, s = (self.c, self.s) if v.ndim == 3 else (self.c[..., None], self.s[..., None])
+        x, y, z = v[:, :, 0], v[:, :, 1], v[:, :, 2]
+        out[:, :, 0] = c * x + s * y
+        out[:, :, 1] = c * y - s * x
+        out[:, :, 2] = z
+        return out
+
+    def place(self, p, out):
+        """Move and rotate points (N, P, 3) into the frame."""
+        return self.turn(p - self.origin[:, None], out)
+
+
+def observe_user(frame: HeadingFrame, pos, rot, out):
+    r"""Sensor part of the observation  [Reda23 Eq. 4]: o_user = [h, l, r, R_h, R_l, R_r].
+
+    Args      pos (N, 3, 3) [m], rot (N, 3, 3, 2) first two columns of the rotations, world, mapped by the root scale
+              out (N, 27)
+    Test      tests/test_env.py::test_observation_terms
+    """
+    n = len(pos)
+    frame.place(pos, out[:, :9].reshape(n, 3, 3))
+    frame.turn(rot, out[:, 9:].reshape(n, 3, 3, 2))
+    return out
+
+
+def observe_sim(frame: HeadingFrame, qpos, qvel, spin, link_pos, link_rot, out):
+    r"""Character part of the observation  [Reda23 Eq. 3]: o_sim = [q, q̇, x, R].
+
+    ASSUMED   q̇ of the root (its linear and angular velocity, turned into the frame) leads q̇; q of the root is in x and R.
+    Args      qpos (N, 7+j), qvel (N, 6+j), spin (N, 3) root angular velocity, world; link_pos (N, l, 3); link_rot (N, l, 3, 2)
+              out (N, j + 6 + j + 9 l)
+    Test      tests/test_env.py::test_observation_terms
+    """
+    n, j, links = len(qpos), qpos.shape[1] - 7, link_pos.shape[1]
+    out[:, :j] = qpos[:, 7:]
+    frame.turn(qvel[:, None, :3], out[:, j : j + 3].reshape(n, 1, 3))
+    frame.turn(spin[:, None], out[:, j + 3 : j + 6].reshape(n, 1, 3))
+    out[:, j + 6 : 2 * j + 6] = qvel[:, 6:]
+    rest = out[:, 2 * j + 6 :]
+    frame.place(link_pos, rest[:, : 3 * links].reshape(n, links, 3))
+    frame.turn(link_rot, rest[:, 3 * links :].reshape(n, links, 3, 2))
+    return out
+
+
+def observation_terms(char: Character) -> dict:
+    """Name -> size, in the order of the vector; the actor's [Eq. 2] first, then the critic's.
+
+    ASSUMED   o_{t-1,user} is expressed in the frame of time t, so that its difference to o_{t,user} is a velocity.
+    Test      tests/test_env.py::test_observation_terms"""
+    j, links = char.j, len(char.obs_links)
+    actor = dict(q=j, qd=6 + j, x=3 * links, R=6 * links, user_previous=USER_SIZE, user=USER_SIZE)
+    critic = dict(human_pos=45, human_rot=90) | {f"human_pos_in_{k}": 45 for k in FUTURES}
+    return {"actor": actor, "critic": critic}
+
+
+# ------------------------------------------------------------------------------------ reward
+
+
+def kernel(w, k, d):
+    r"""[Reda23 Eq. 8] r(s) = w_s exp(−k_s d(s_sim, s_kin)).  d (N,) -> (N,).  Test: tests/test_env.py::test_reward_terms"""
+    return w * np.exp(-k * d)
+
+
+def weighted_distance(sim, ref, weights):
+    r"""[Reda23 Eq. 11] d = Σ_i w_i ‖x_{i,sim} − x_{i,gt}‖²; i runs over joint angles (N, j) or links (N, l, 3).
+
+    The weights come normalised to sum 1 (ASSUMED, `retarget.normalised`).  -> (N,)
+    Test      tests/test_env.py::test_reward_terms
+    """
+    d = np.square(sim - ref)
+    return (d if d.ndim == 2 else d.sum(-1)) @ weights
+
+
+def reward_q(w, k, q_sim, q_kin, weights):
+    """[Reda23 Eq. 6, Table 2] joint angles (N, j) [rad].  Test: tests/test_env.py::test_reward_terms"""
+    return kernel(w, k, weighted_distance(q_sim, q_kin, weights))
+
+
+def reward_qd(w, k, qd_sim, qd_kin, weights):
+    """[Reda23 Eq. 6, Table 2] joint velocities (N, j) [rad/s].  Test: tests/test_env.py::test_reward_terms"""
+    return kernel(w, k, weighted_distance(qd_sim, qd_kin, weights))
+
+
+def reward_x(w, k, x_sim, x_kin, weights):
+    """[Reda23 Eq. 6, Table 2] link positions (N, l, 3) [m], world.  Test: tests/test_env.py::test_reward_terms"""
+    return kernel(w, k, weighted_distance(x_sim, x_kin, weights))
+
+
+def reward_xd(w, k, xd_sim, xd_kin, weights):
+    """[Reda23 Eq. 6, Table 2] link velocities (N, l, 3) [m/s], world.  Test: tests/test_env.py::test_reward_terms"""
+    return kernel(w, k, weighted_distance(xd_sim, xd_kin, weights))
+
+
+def reward_orientation(w, k, quat_sim, quat_human):
+    r"""[Reda23 §3.5.1, App. A] orientation of root and head against the HUMAN's.
+
+    Equation  d = mean over root and head of ‖log(q_gt q_sim^{-1})‖, an angle
+    ASSUMED   one kernel over both, their mean
+    Args      quat_sim, quat_human : (N, 2, 4), world
+    Returns   (N,)
+    Test      tests/test_env.py::test_reward_terms
+    """
+    return kernel(w, k, quat_angle(quat_human, quat_sim).mean(-1))
+
+
+def reward_contact(w, k, c_sim, c_human):
+    r"""[Reda23 §3.5.2, App. A] do the feet's contacts coincide?
+
+    Equation  d = ‖c_sim − c_human‖ over the two feet's booleans: 0, 1 or √2 (ASSUMED: not squared)
+    Args      c_sim : (N, 2) bool, contact force > 1 N; c_human : (N, 2) bool
+    Returns   (N,)
+    Test      tests/test_env.py::test_reward_terms
+    """
+    return kernel(w, k, np.sqrt(np.sum(c_sim != c_human, axis=-1)))
+
+
+def reward_action_diff(w, k, a_prev, a):
+    r"""[Reda23 Eq. 9] d = (1/N) Σ_i (a_{t−1,i} − a_{t,i})².  Actions (N, u) as the physics gets them: clipped (ASSUMED).
+
+    Test      tests/test_env.py::test_reward_terms"""
+    return kernel(w, k, np.square(a_prev - a).mean(-1))
+
+
+def reward_action_min(w, k, a):
+    r"""[Reda23 Eq. 10] d = (1/N) Σ_i a_{t,i}².  Test: tests/test_env.py::test_reward_terms"""
+    return kernel(w, k, np.square(a).mean(-1))
+
+
+def total_reward(terms: dict):
+    r"""[Reda23 Eqs. 5 to 7] r = r(imitation) + r(contact) + r(action).
+
+    imitation = q + qd + x + xd + orientation;  action = action_diff + action_min
+    Test      tests/test_env.py::test_total_reward
+    """
+    imitation = terms["q"] + terms["qd"] + terms["x"] + terms["xd"] + terms["orientation"]
+    action = terms["action_diff"] + terms["action_min"]
+    return imitation + terms["contact"] + action
+
+
+# ------------------------------------------------------------------------------------ termination
+
+
+def fallen(fall_height):
+    """[Reda23 §3.6] the upper body touches the ground.  fall_height (N,) [m].  Test: tests/test_env.py::test_termination"""
+    return fall_height <= 0.0
+
+
+def too_far(root_pos, root_target):
+    """[Reda23 §3.6] the root is more than 0.30 m from the scaled mocap root, in 3-D (ASSUMED).  Test: tests/test_env.py::test_termination"""
+    return np.linalg.norm(root_pos - root_target, axis=-1) > ROOT_LIMIT
+
+
+# ------------------------------------------------------------------------------------ environment
+
+
+class Env:
+    """N characters following random places of a reference  [Reda23 §3.6].
+
+    As Gymnasium's vector environments with autoreset in the same step: `step` returns the observation of the new episode where one
+    ended, and info["final_obs"] the observation it ended with.
+
+    char, ref : `retarget.character`, `retarget.reference`
+    n         : number of environments
+    threads   : physics threads, 0 = all cores; results do not depend on it
+    horizon   : control steps to truncation
+    """
+
+    ENDS = ("fall", "far", "bad", "time", "clip")  # why an episode ends: three failures, two truncations
+
+    def __init__(self, char: Character, ref: Reference, n: int, seed=0, threads=0, horizon=EPISODE_STEPS, rate=CONTROL_RATE, substeps=SUBSTEPS):
+        self.char, self.ref, self.n, self.horizon, self.substeps = char, ref, n, horizon, substeps
+        self.dt = 1.0 / rate
+        char.model.opt.timestep = self.dt / substeps
+        self.batch = char.batch(n, threads)
+        bind = self.batch.bind
+        self.qpos, self.qvel, self.ctrl, self.warmstart = bind("qpos"), bind("qvel"), bind("ctrl"), bind("qacc_warmstart")
+        self.xpos, self.xmat, self.xquat = bind("xpos"), bind("xmat"), bind("xquat")
+        self.cvel, self.com, self.sensordata = bind("cvel"), bind("subtree_com"), bind("sensordata")
+        self.geom_xpos, self.geom_xmat = bind("geom_xpos"), bind("geom_xmat")
+        self.terms = observation_terms(char)
+        self.slices, start = {}, 0
+        for name, size in (self.terms["actor"] | self.terms["critic"]).items():
+            self.slices[name] = slice(start, start + size)
+            start += size
+        self.obs_size = sum(self.terms["actor"].values())
+        self.critic_size = start
+        self.action_size = len(char.limits)
+        self.full = np.zeros((n, start), np.float32)  # actor's observation, then the critic's
+        self.frame = np.zeros(n, int)  # reference frame of the present state
+        self.sequence = np.zeros(n, int)
+        self.steps = np.zeros(n, int)
+        self.available = np.ones(n, int)  # control steps from the start to the clip's end or the horizon
+        self.action = np.zeros((n, self.action_size))
+        self.contact = np.zeros((n, 2), bool)
+        self.rng = np.random.default_rng(seed)
+        # a start needs a frame before it (o_{t-1,user}) and one after it
+        self.starts = np.concatenate([np.arange(a + 1, b) for a, b in zip(ref.first, ref.last, strict=True)])
+        self.owner = np.repeat(np.arange(len(ref.first)), ref.last - ref.first + 1)
+
+    # ---- reset
+
+    def reset(self, seed: int | None = None, frames=None):
+        """Start all environments, at random reference frames or at the given ones (N,).  -> obs (N, obs_size), info
+
+        Test      tests/test_env.py::test_reset_reproduces_reference
+        """
+        if seed is not None:
+            self.rng = np.random.default_rng(seed)
+        self._reset(np.arange(self.n), frames)
+        self._observe(slice(None))
+        return self.full[:, : self.obs_size], {"critic": self.full}
+
+    def _reset(self, ids, frames=None):
+        """Reference-state initialisation: a random mocap frame, retargeted, position and velocity."""
+        f = self.rng.choice(self.starts, len(ids)) if frames is None else np.asarray(frames)
+        self.frame[ids], self.sequence[ids], self.steps[ids] = f, self.owner[f], 0
+        self.available[ids] = np.minimum(self.horizon, self.ref.last[self.owner[f]] - f)
+        self.qpos[ids], self.qvel[ids] = self.ref.qpos[f], self.ref.qvel[f]
+        self.action[ids], self.ctrl[ids], self.warmstart[ids] = 0.0, 0.0, 0.0
+        self.batch.forward(ids, STAGE_VEL)
+
+    # ---- step
+
+    def step(self, action):
+        """Advance one control step.  action (N, u): unclipped, as the policy drew it.
+
+        Returns   obs (N, obs_size) float32, reward (N,), terminated (N,), truncated (N,) bool, info:
+                  critic       : (N, critic_size) observation and privileged part
+                  final_obs, final_critic, _final_obs : the same before the reset, and where they hold
+                  length, available : (N,) control steps lived, and that could have been lived
+                  terms        : name -> (N,) reward term; ends : name -> (N,) bool
+        Raises    ValueError: an action is not finite
+        Test      tests/test_env.py::test_step_contract
+        """
+        a = np.clip(action, -1.0, 1.0)  # only the physics sees clipped actions (design.md, mistake 3)
+        if not np.isfinite(a).all():
+            raise ValueError(f"action of environment {int(np.argmin(np.isfinite(a).all(1)))} is not finite")
+        self.ctrl[:] = a
+        self.batch.step(nstep=self.substeps, stage=STAGE_VEL)
+        self.frame += 1
+        self.steps += 1
+        bad = self._recover()
+        f = self.frame
+        self.contact = self._contact()
+        terms = self.reward_terms(a)
+        ends = dict(
+            fall=fallen(geom_lowest(self.char.model, self.char.fall_geoms, self.geom_xpos, self.geom_xmat).min(1)) & ~bad,
+            far=too_far(self.qpos[:, :3], self.ref.qpos[f, :3]) & ~bad,
+            bad=bad,
+        )
+        ends["far"] &= ~ends["fall"]
+        terminated = ends["fall"] | ends["far"] | ends["bad"]
+        ends["clip"] = (f >= self.ref.last[self.sequence]) & ~terminated
+        ends["time"] = (self.steps >= self.horizon) & ~terminated & ~ends["clip"]
+        truncated = ends["clip"] | ends["time"]
+        reward = np.where(bad, 0.0, total_reward(terms)) + np.where(terminated, self.char.reward["fail"], 0.0)
+        self.action[:] = a
+        self._observe(slice(None))
+        done = np.flatnonzero(terminated | truncated)
+        info = {"terms": terms, "ends": ends, "_final_obs": terminated | truncated, "length": self.steps.copy(), "available": self.available.copy()}
+        if len(done):
+            info["final_critic"] = self.full.copy()
+            info["final_obs"] = info["final_critic"][:, : self.obs_size]
+            self._reset(done)
+            self._observe(done)
+        info["critic"] = self.full
+        return self.full[:, : self.obs_size], reward, terminated, truncated, info
+
+    def _recover(self):
+        """Environments whose state is not finite, or that MuJoCo had to reset: put back on the reference, ended as failures, so that
+        nothing non-finite reaches the networks (design.md, mistake 11).  -> (N,) bool"""
+        bad = ~(np.isfinite(self.qpos).all(1) & np.isfinite(self.qvel).all(1)) | (self.batch.warning[:, BAD, 1] > 0).any(1)
+        if bad.any():
+            ids = np.flatnonzero(bad)
+            self.batch.warning[ids] = 0
+            self.qpos[ids], self.qvel[ids] = self.ref.qpos[self.frame[ids]], self.ref.qvel[self.frame[ids]]
+            self.warmstart[ids] = 0.0
+            self.batch.forward(ids, STAGE_VEL)
+        return bad
+
+    def _contact(self):
+        """Feet whose normal force on the floor exceeds 1 N during the last substep.  (N, 2) bool"""
+        return np.abs(self.sensordata[:, self.char.contact_adr]) > FORCE_LIMIT
+
+    def reward_terms(self, a) -> dict:
+        """Every term of Eqs. 5 to 7 at the present state, by name; a term of weight 0 is 0.  a (N, u) clipped."""
+        c, ref, f, r = self.char, self.ref, self.frame, self.char.reward
+        links = c.reward_links
+        values = dict(
+            q=lambda w, k: reward_q(w, k, self.qpos[:, 7:], ref.qpos[f, 7:], c.joint_weights),
+            qd=lambda w, k: reward_qd(w, k, self.qvel[:, 6:], ref.qvel[f, 6:], c.joint_weights),
+            x=lambda w, k: reward_x(w, k, self.xpos[:, links], ref.link_pos[f], c.link_weights),
+            xd=lambda w, k: reward_xd(w, k, self.link_velocity(), ref.link_vel[f], c.link_weights),
+            orientation=lambda w, k: reward_orientation(w, k, self.xquat[:, [c.root, c.head]], ref.orientation[f]),
+            contact=lambda w, k: reward_contact(w, k, self.contact, ref.contact[f]),
+            action_diff=lambda w, k: reward_action_diff(w, k, self.action, a),
+            action_min=lambda w, k: reward_action_min(w, k, a),
+        )
+        return {name: values[name](*r[name]) if r[name][0] else np.zeros(self.n) for name in TERMS}
+
+    def link_velocity(self):
+        """Linear velocities of the reward links.  (N, l, 3) [m/s], world"""
+        links = self.char.reward_links
+        return body_velocity(self.cvel[:, links], self.xpos[:, links], self.com[:, self.char.root])
+
+    # ---- observation
+
+    def _observe(self, ids):
+        """Fill the rows `ids` of self.full (a slice or indices)."""
+        char, ref, f = self.char, self.ref, self.frame[ids]
+        n = len(f)
+        out = self.full[ids] if not isinstance(ids, slice) else self.full
+        s = self.slices
+        links = char.obs_links
+        qpos, qvel = self.qpos[ids], self.qvel[ids]
+        frame = HeadingFrame(qpos[:, :3], qpos[:, 3:7])
+        rot = self.xmat[ids][:, links].reshape(n, len(links), 3, 3)[..., :2]
+        sim = out[:, s["q"].start : s["R"].stop]
+        observe_sim(frame, qpos, qvel, self.cvel[ids][:, char.root, :3], self.xpos[ids][:, links], rot, sim)
+        observe_user(frame, ref.sensor_pos[f - 1], ref.sensor_rot[f - 1], out[:, s["user_previous"]])
+        observe_user(frame, ref.sensor_pos[f], ref.sensor_rot[f], out[:, s["user"]])
+        last = ref.last[self.sequence[ids]]
+        frame.place(ref.human_pos[f], out[:, s["human_pos"]].reshape(n, 15, 3))
+        frame.turn(ref.human_rot[f], out[:, s["human_rot"]].reshape(n, 15, 3, 2))
+        for k in FUTURES:
+            ahead = np.minimum(f + k, last)
+            frame.place(ref.human_pos[ahead], out[:, s[f"human_pos_in_{k}"]].reshape(n, 15, 3))
+        if not isinstance(ids, slice):
+            self.full[ids] = out
+
+    # ---- exact resume
+
+    def state(self) -> tuple[dict, dict]:
+        """Arrays and JSON that `load_state` continues from bit-exactly.  Test: tests/test_ppo.py::test_resume_is_exact"""
+        arrays = dict(state=self.batch.state, frame=self.frame, steps=self.steps, available=self.available, action=self.action)
+        return {k: v.copy() for k, v in arrays.items()}, {"rng": rng_state(self.rng)}
+
+    def load_state(self, arrays, meta):
+        self.batch.state[:] = arrays["state"]
+        self.frame[:], self.steps[:], self.action[:] = arrays["frame"], arrays["steps"], arrays["action"]
+        self.available[:] = arrays["available"]
+        self.sequence[:] = self.owner[self.frame]
+        self.rng = rng_from_state(meta["rng"])
+        self.batch.forward(None, STAGE_VEL)
+        self._observe(slice(None))
+        return self.full[:, : self.obs_size], {"critic": self.full}

@@ -1,0 +1,556 @@
+r"""Proximal policy optimisation, every gradient by hand  [Reda23 §3.1, §3.7, Appendix B].
+
+    python ppo.py --character jesse                                    learn on the built-in motions
+    python ppo.py --character jesse --motion FOLDER --out runs/a       learn on motion capture
+    python ppo.py --resume --out runs/a --steps 20e6                   continue exactly where it stopped
+
+One update:  collect `horizon` steps of `envs` characters with the present policy  ->  values, advantages (gae)  ->
+`epochs` passes over the samples in minibatches of the clipped loss (policy) and the squared error (value).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+import time
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+import mocap
+import retarget
+from env import EPISODE_STEPS, Env
+from nn import (
+    MLP,
+    Adam,
+    RunningNorm,
+    clip_grad_norm,
+    gaussian_entropy,
+    gaussian_kl,
+    gaussian_logp,
+    gaussian_logp_backward,
+    value_loss,
+)
+from retarget import TERMS
+from runs import (
+    ALL_POSITIVE,
+    CHECKPOINT,
+    METRICS,
+    NONNEGATIVE,
+    POSITIVE,
+    UNIT,
+    Metrics,
+    Progress,
+    UserError,
+    arg,
+    cli,
+    fmt_count,
+    latest_checkpoint,
+    load_checkpoint,
+    open_run,
+    read_config,
+    rng_from_state,
+    rng_state,
+    run_main,
+    save_checkpoint,
+)
+
+
+@dataclass
+class Options:
+    """Everything a run is made of.  Table 3 of the paper (its hyper-parameters) is lost: these are ASSUMED, from measured runs."""
+
+    character: str = arg("jesse", "name in characters/, or path of a .toml")
+    motion: str = arg("builtin", "builtin, a .bvh file, or a folder of them")
+    clips: str = arg("*", "shell pattern on clip names, such as '*walk*'")
+    steps: int = arg(20_000_000, "control steps to train", check=POSITIVE)
+    envs: int = arg(512, "characters simulated side by side", check=POSITIVE)
+    horizon: int = arg(32, "control steps of each character per update", check=POSITIVE)
+    seed: int = arg(0, "seed of everything random", check=NONNEGATIVE)
+    out: str | None = arg(None, "run folder; runs/CHARACTER by default")
+    resume: bool = arg(False, "continue the run in --out exactly")
+    init: str | None = arg(None, "start from the weights of a policy (.npz) or a run folder")
+    threads: int = arg(0, "physics threads, 0 = all cores", check=NONNEGATIVE)
+    checkpoint_minutes: float = arg(3.0, "minutes between checkpoints", check=NONNEGATIVE)
+    gamma: float = arg(0.97, "discount (QuestSim's)", check=UNIT)
+    lam: float = arg(0.95, "lambda of generalised advantage estimation; 1 is Appendix B's return", check=UNIT)
+    clip_eps: float = arg(0.2, "epsilon of the clipped loss", check=POSITIVE)
+    epochs: int = arg(4, "passes over the samples per update", check=POSITIVE)
+    minibatch: int = arg(4096, "samples per gradient step", check=POSITIVE)
+    lr: float = arg(1e-4, "policy's learning rate to start from; adapted to --target-kl", check=POSITIVE)
+    value_lr: float = arg(1e-3, "value network's learning rate", check=POSITIVE)
+    target_kl: float = arg(0.025, "KL divergence per update that the policy's learning rate aims at", check=POSITIVE)
+    max_grad_norm: float = arg(1.0, "gradient norm limit", check=POSITIVE)
+    hidden: tuple[int, ...] = arg((256, 128), "hidden layers of the policy", check=ALL_POSITIVE)
+    value_hidden: tuple[int, ...] = arg((256, 128), "hidden layers of the value network", check=ALL_POSITIVE)
+    sigma: float = arg(0.135, "standard deviation of the exploration noise at the start", check=POSITIVE)
+    min_sigma: float = arg(0.05, "below this the standard deviations do not fall", check=POSITIVE)
+    episode: int = arg(EPISODE_STEPS, "control steps to truncation [§3.6]", check=POSITIVE)
+
+
+# ------------------------------------------------------------------------------------ Appendix B
+
+
+def gae(reward, value, next_value, done, gamma, lam):
+    r"""Generalised advantage estimation; with λ = 1 the return of Appendix B minus the old value.
+
+    Equation  δ_t = r_t + γ V(o_{t+1}) − V(o_t);  A_t = δ_t + γ λ (1 − done_t) A_{t+1}
+    Symbols   V(o_{t+1}) -> next_value: of the state the step led to, BEFORE any reset: 0 after a failure, the old network's
+              value after a truncation and at the end of the collected trajectory (bootstrap)
+    Args      reward, value, next_value : (T, N); done : (T, N) bool, terminated or truncated
+    Returns   advantage (T, N), return = advantage + value (T, N)
+    Raises    ValueError: shapes differ
+    Source    Schulman et al. 2016, Eq. 16; [Reda23 App. B]
+    Test      tests/test_ppo.py::test_gae_against_slow_loop, test_lambda_one_is_appendix_b
+    """
+    if not reward.shape == value.shape == next_value.shape == done.shape:
+        raise ValueError(f"shapes differ: reward {reward.shape}, value {value.shape}, next_value {next_value.shape}, done {done.shape}")
+    delta = reward + gamma * next_value - value
+    advantage = np.zeros_like(delta)
+    carry = np.zeros_like(delta[0])
+    for t in reversed(range(len(delta))):
+        carry = delta[t] + gamma * lam * np.where(done[t], 0.0, carry)
+        advantage[t] = carry
+    return advantage, advantage + value
+
+
+def clipped_surrogate(logp, logp_old, adv, eps):
+    r"""Clipped policy loss and its gradient.
+
+    Equation  [Reda23 App. B] L = mean min(ρ A, clip(ρ, 1−ε, 1+ε) A), ρ = exp(log π − log π_old)
+    Symbols   ρ_t -> ratio, A_t -> adv, ε -> eps
+    Departs   returns −L, because the optimiser minimises
+    Args      logp, logp_old : (B,) float32 [nat]; adv : (B,) float32 [-], standardised
+    Returns   loss : float; dlogp : (B,) d loss / d logp; ratio : (B,)
+    Raises    ValueError: shapes differ, or eps outside (0, 1)
+    Test      tests/test_ppo.py::test_clipped_surrogate
+    """
+    if not (np.shape(logp) == np.shape(logp_old) == np.shape(adv)):
+        raise ValueError(f"shapes differ: logp {np.shape(logp)}, logp_old {np.shape(logp_old)}, adv {np.shape(adv)}")
+    if not 0.0 < eps < 1.0:
+        raise ValueError(f"eps is {eps}, expected a number in (0, 1)")
+    ratio = np.exp(logp - logp_old)  # (B,)
+    free, held = ratio * adv, np.clip(ratio, 1.0 - eps, 1.0 + eps) * adv  # (B,)
+    loss = -float(np.mean(np.minimum(free, held)))
+    # The gradient flows where the unclipped term is the smaller one; d ratio / d logp = ratio.
+    dlogp = np.where(free <= held, -free / len(free), 0.0).astype(free.dtype)  # (B,)
+    return loss, dlogp, ratio
+
+
+def standardise(x):
+    """Â = (A − mean) / (std + 1e-8).  ASSUMED: Appendix B's Â is not defined.  Test: tests/test_ppo.py::test_standardise"""
+    return (x - x.mean()) / (x.std() + 1e-8)
+
+
+def policy_loss(policy: Policy, x, action, logp_old, adv, eps):
+    r"""Loss of a minibatch and its gradient with respect to all of the policy's parameters.
+
+    Equation  −L(θ) of Appendix B, π_θ = N(μ_θ(o), diag σ²)
+    Args      x (B, obs), normalised; action (B, u), unclipped; logp_old, adv (B,)
+    Returns   loss : float; gradient (P,) laid out as policy.theta_pi; dict(mu, ratio)
+    Test      tests/test_ppo.py::test_policy_loss_gradient
+    """
+    mu, cache = policy.actor.forward(x)
+    logp = gaussian_logp(action, mu, policy.log_std)
+    loss, dlogp, ratio = clipped_surrogate(logp, logp_old, adv, eps)
+    dmu, dlog_std = gaussian_logp_backward(dlogp, action, mu, policy.log_std)
+    _, dtheta = policy.actor.backward(dmu, cache, want_dx=False)
+    return loss, np.concatenate([dtheta, dlog_std.astype(dtheta.dtype)]), {"mu": mu, "ratio": ratio}
+
+
+def critic_loss(policy: Policy, x, target):
+    r"""½ mean (V(o) − target)² and its gradient  [Reda23 App. B, "supervised learning"].
+
+    Args      x (B, critic), normalised; target (B,), in units of policy.value_scale
+    Returns   loss : float; gradient (P,)
+    Test      tests/test_ppo.py::test_critic_loss_gradient
+    """
+    v, cache = policy.critic.forward(x)
+    loss, dv = value_loss(v[:, 0], target)
+    _, dtheta = policy.critic.backward(dv[:, None], cache, want_dx=False)
+    return loss, dtheta
+
+
+def explained_variance(value, target):
+    """1 − Var(target − value) / Var(target): 1 is a perfect critic, 0 as good as the mean."""
+    var = np.var(target)
+    return float(1.0 - np.var(target - value) / var) if var > 0 else 0.0
+
+
+# ------------------------------------------------------------------------------------ policy
+
+
+class Policy:
+    """Actor, critic, exploration noise and the normaliser of their inputs.
+
+    theta_pi    : (P + u,) the actor's weights, then log σ: one vector, so one Adam
+    norm        : of the whole critic observation; its first obs_size entries are the actor's
+    value_scale : V = value_scale × critic(o), so that the network's output is of order 1
+    """
+
+    def __init__(self, obs_size, critic_size, action_size, hidden, value_hidden, sigma, value_scale, rng, dtype=np.float32):
+        self.obs_size, self.critic_size, self.action_size, self.value_scale = obs_size, critic_size, action_size, value_scale
+        self.hidden, self.value_hidden = tuple(hidden), tuple(value_hidden)
+        self.actor = MLP((obs_size, *hidden, action_size), rng=rng, gain=0.01, dtype=dtype)
+        self.critic = MLP((critic_size, *value_hidden, 1), rng=rng, gain=1.0, dtype=dtype)
+        log_std = np.full(action_size, np.log(sigma), dtype)
+        self.theta_pi = np.concatenate([self.actor.theta, log_std])
+        self.actor.theta = self.theta_pi[: self.actor.n_params]
+        self.log_std = self.theta_pi[self.actor.n_params :]
+        self.norm = RunningNorm(critic_size)
+
+    def mean_action(self, obs):
+        """The policy without noise, for playing.  obs (N, obs_size), raw -> (N, u)"""
+        n = self.norm
+        x = np.clip((obs - n.mean[: self.obs_size]) * n.inv_std[: self.obs_size], -n.clip, n.clip)
+        return self.actor(x)
+
+    def value(self, x, rows=8192):
+        """V of normalised critic observations (B, critic_size) -> (B,) float64."""
+        out = [self.critic(x[i : i + rows])[:, 0] for i in range(0, len(x), rows)]
+        return np.concatenate(out).astype(float) * self.value_scale
+
+    def arrays(self):
+        """All that makes the policy, for a checkpoint.  Test: tests/test_ppo.py::test_policy_round_trip"""
+        norm = {f"policy.norm.{k}": v for k, v in self.norm.state().items()}
+        return {"policy.pi": self.theta_pi.copy(), "policy.critic": self.critic.theta.copy(), **norm}
+
+    def shape(self):
+        return {
+            "obs_size": self.obs_size,
+            "critic_size": self.critic_size,
+            "action_size": self.action_size,
+            "hidden": list(self.hidden),
+            "value_hidden": list(self.value_hidden),
+            "value_scale": self.value_scale,
+        }
+
+    def load(self, arrays):
+        self.theta_pi[:], self.critic.theta[:] = arrays["policy.pi"], arrays["policy.critic"]
+        self.norm.load_state({k: arrays[f"policy.norm.{k}"] for k in ("count", "mean", "m2")})
+
+
+def load_policy(path) -> tuple[Policy, dict]:
+    """Read a policy from a run folder, or from a checkpoint's or shipped policy's .npz.
+
+    Returns   Policy with the normaliser frozen; meta with "options", "steps" and what else was saved
+    Raises    UserError: missing, damaged, or not a policy
+    Test      tests/test_ppo.py::test_policy_round_trip
+    """
+    path = Path(path)
+    names = ("policy.pi", "policy.critic", "policy.norm.mean", "policy.norm.m2")
+    loaded = latest_checkpoint(path, names) if path.is_dir() else load_checkpoint(path, names)
+    if loaded is None:
+        raise UserError(f"{path}: holds no checkpoint; valid: a run folder with {CHECKPOINT}, or a policy's .npz")
+    arrays, meta = loaded
+    try:
+        shape = dict(meta["policy"])
+        policy = Policy(sigma=1.0, rng=np.random.default_rng(0), **shape)
+        policy.load(arrays)
+    except (KeyError, TypeError, ValueError) as e:
+        raise UserError(f"{path}: not a policy ({e}); valid: a checkpoint that ppo.py wrote") from None
+    policy.norm.frozen = True
+    return policy, meta
+
+
+def check_fits(policy: Policy, env: Env, path):
+    """UserError if a policy was trained for another character or another observation."""
+    have, need = (policy.obs_size, policy.action_size), (env.obs_size, env.action_size)
+    if have != need:
+        raise UserError(
+            f"{path}: a policy of {have[0]} observations and {have[1]} actions; {env.char.name} needs {need[0]} and {need[1]}: "
+            "use the character it was trained for"
+        )
+
+
+# ------------------------------------------------------------------------------------ the loop
+
+
+class Trainer:
+    """Collect, estimate, update; all state that a resumed run needs.
+
+    Test: tests/test_ppo.py::test_resume_is_exact, test_learns
+    """
+
+    def __init__(self, opt: Options, env: Env):
+        self.opt, self.env = opt, env
+        self.rng = np.random.default_rng([opt.seed, 1])
+        weights = sum(env.char.reward[t][0] for t in TERMS)
+        scale = weights / max(1.0 - opt.gamma, 1e-3)  # the largest return
+        sizes = (env.obs_size, env.critic_size, env.action_size)
+        self.policy = Policy(*sizes, opt.hidden, opt.value_hidden, opt.sigma, scale, np.random.default_rng([opt.seed, 2]))
+        self.adam_pi = Adam(self.policy.theta_pi.size, opt.lr)
+        self.adam_v = Adam(self.policy.critic.theta.size, opt.value_lr)
+        self.steps = self.updates = 0
+        t, n = opt.horizon, env.n
+        self.x = np.zeros((t, n, env.critic_size), np.float32)  # normalised observations
+        self.raw = np.zeros((t, n, env.critic_size), np.float32)
+        self.action, self.mu = (np.zeros((t, n, env.action_size), np.float32) for _ in range(2))
+        self.logp = np.zeros((t, n), np.float32)
+        self.reward, self.next_value = np.zeros((t, n)), np.zeros((t, n))
+        self.terminated, self.truncated = np.zeros((t, n), bool), np.zeros((t, n), bool)
+
+    def start(self):
+        """First observation; the normaliser begins with it, or the first update would see unscaled inputs."""
+        self.env.reset(self.opt.seed)
+        if self.policy.norm.count == 0:
+            self.policy.norm.update(self.env.full)
+
+    def collect(self) -> dict:
+        """`horizon` steps of every environment with the present policy.  -> what happened, for the progress line"""
+        env, policy, norm = self.env, self.policy, self.policy.norm
+        finals = []  # (t, ids, rows): observations at truncations, before the reset
+        sums = dict.fromkeys(TERMS, 0.0)
+        ends = dict.fromkeys(env.ENDS, 0)
+        lengths, shares = [], []
+        sigma = np.exp(policy.log_std)
+        for t in range(self.opt.horizon):
+            self.raw[t] = env.full
+            x = norm.normalise(env.full, out=self.x[t])
+            mu = policy.actor(x[:, : env.obs_size])
+            noise = self.rng.standard_normal(mu.shape, dtype=np.float32)
+            a = mu + sigma * noise
+            self.mu[t], self.action[t], self.logp[t] = mu, a, gaussian_logp(a, mu, policy.log_std)
+            _, r, terminated, truncated, info = env.step(a)
+            self.reward[t], self.terminated[t], self.truncated[t] = r, terminated, truncated
+            if truncated.any():
+                ids = np.flatnonzero(truncated)
+                finals.append((t, ids, norm.normalise(info["final_critic"][ids])))
+            for name in TERMS:
+                sums[name] += info["terms"][name].mean()
+            for name in ends:
+                ends[name] += int(info["ends"][name].sum())
+            done = terminated | truncated
+            lengths.append(info["length"][done])
+            shares.append((info["length"] / info["available"])[done])
+        self.steps += self.opt.horizon * env.n
+        self._values(finals)
+        lengths, shares = np.concatenate(lengths), np.concatenate(shares)
+        failures = ends["fall"] + ends["far"] + ends["bad"]
+        seconds = self.opt.horizon * env.n * env.dt
+        stats = dict(
+            episodes=len(lengths),
+            length=float(lengths.mean()) if len(lengths) else float("nan"),
+            survival=float(shares.mean()) if len(shares) else float("nan"),
+            time_to_failure=seconds / max(failures, 1),
+            reward=float(self.reward.mean()),
+        )
+        stats |= {f"r_{k}": v / self.opt.horizon for k, v in sums.items()}
+        return stats | {f"end_{k}": v for k, v in ends.items()}
+
+    def _values(self, finals):
+        """V(o_t) and V(o_{t+1}) of everything collected, with the old network."""
+        env, policy = self.env, self.policy
+        t, n = self.reward.shape
+        self.old_value = policy.value(self.x.reshape(t * n, -1)).reshape(t, n)
+        self.next_value[:-1] = self.old_value[1:]
+        self.next_value[-1] = policy.value(policy.norm.normalise(env.full))  # Appendix B: bootstrap at the trajectory's end
+        for step, ids, rows in finals:  # truncation is not failure (design.md, mistake 1)
+            self.next_value[step, ids] = policy.value(rows)
+        self.next_value[self.terminated] = 0.0
+
+    def update(self) -> dict:
+        """Several epochs of minibatches of the two losses; then the learning rate follows the KL divergence."""
+        opt, policy = self.opt, self.policy
+        done = self.terminated | self.truncated
+        advantage, target = gae(self.reward, self.old_value, self.next_value, done, opt.gamma, opt.lam)
+        variance = explained_variance(self.old_value, target)
+        flat = lambda v: v.reshape(-1, *v.shape[2:])  # noqa: E731
+        x, action, mu, logp = flat(self.x), flat(self.action), flat(self.mu), flat(self.logp)
+        adv = standardise(advantage).ravel().astype(np.float32)
+        target = (target / policy.value_scale).ravel().astype(np.float32)
+        old_std = policy.log_std.copy()
+        samples = len(adv)
+        kls, clipped, pi_losses, v_losses = [], [], [], []
+        for _ in range(opt.epochs):
+            order = self.rng.permutation(samples)
+            kls = []
+            for start in range(0, samples, opt.minibatch):
+                rows = order[start : start + opt.minibatch]
+                xb = x[rows]
+                loss, grad, out = policy_loss(policy, xb[:, : policy.obs_size], action[rows], logp[rows], adv[rows], opt.clip_eps)
+                clip_grad_norm(grad, opt.max_grad_norm)
+                kls.append(gaussian_kl(mu[rows], old_std, out["mu"], policy.log_std))
+                self.adam_pi.step(policy.theta_pi, grad)
+                np.maximum(policy.log_std, np.log(opt.min_sigma), out=policy.log_std)
+                v_loss, v_grad = critic_loss(policy, xb, target[rows])
+                clip_grad_norm(v_grad, opt.max_grad_norm)
+                self.adam_v.step(policy.critic.theta, v_grad)
+                clipped.append(float(np.mean(np.abs(out["ratio"] - 1.0) > opt.clip_eps)))
+                pi_losses.append(loss), v_losses.append(v_loss)
+            kl = float(np.mean(kls))
+            if kl > 2.0 * opt.target_kl:  # ASSUMED: leave the samples before they no longer describe the policy
+                break
+        # ASSUMED: the step size follows the KL divergence of the last epoch
+        if kl > 1.3 * opt.target_kl:
+            self.adam_pi.lr = max(self.adam_pi.lr / 1.2, 1e-6)
+        elif kl < opt.target_kl / 1.3:
+            self.adam_pi.lr = min(self.adam_pi.lr * 1.2, 1e-2)
+        policy.norm.update(self.raw)
+        self.updates += 1
+        return dict(
+            kl=kl,
+            clip_fraction=float(np.mean(clipped)),
+            explained_variance=variance,
+            lr=self.adam_pi.lr,
+            sigma=float(np.exp(policy.log_std).mean()),
+            entropy=float(gaussian_entropy(policy.log_std)),
+            policy_loss=float(np.mean(pi_losses)),
+            value_loss=float(np.mean(v_losses)),
+            saturation=float(np.mean(np.abs(self.action) > 0.99)),
+        )
+
+    # ---- checkpoints
+
+    def save(self, path, meta):
+        """Everything: policy, optimisers, environments, random states."""
+        env_arrays, env_meta = self.env.state()
+        arrays = self.policy.arrays() | {f"env.{k}": v for k, v in env_arrays.items()}
+        for name, adam in (("adam_pi", self.adam_pi), ("adam_v", self.adam_v)):
+            arrays |= {f"{name}.{k}": v for k, v in adam.state().items()}
+        own = dict(steps=self.steps, updates=self.updates, lr=self.adam_pi.lr, rng=rng_state(self.rng), env=env_meta, policy=self.policy.shape())
+        save_checkpoint(path, arrays, meta | own)
+
+    def restore(self, arrays, meta):
+        """Continue bit-exactly from what `save` wrote."""
+        self.policy.load(arrays)
+        for name, adam in (("adam_pi", self.adam_pi), ("adam_v", self.adam_v)):
+            adam.load_state({k: arrays[f"{name}.{k}"] for k in ("t", "m", "v")})
+        self.adam_pi.lr, self.steps, self.updates = meta["lr"], meta["steps"], meta["updates"]
+        self.rng = rng_from_state(meta["rng"])
+        self.env.load_state({k[4:]: v for k, v in arrays.items() if k.startswith("env.")}, meta["env"])
+
+
+def fingerprint(ref) -> str:
+    """Hash of the reference motions: tells whether two runs saw the same data.  Test: tests/test_ppo.py::test_fingerprint"""
+    return hashlib.sha256(np.ascontiguousarray(ref.qpos)).hexdigest()[:16]
+
+
+def make_env(opt: Options, split="train", n=None) -> Env:
+    """Character, stitched sequences of the split, environment."""
+    char = retarget.character(opt.character)
+    ref = retarget.reference(char, mocap.sequences(opt.motion, split, opt.clips, seed=opt.seed))
+    return Env(char, ref, n or opt.envs, opt.seed, opt.threads, opt.episode)
+
+
+CHANGEABLE = ("steps", "threads", "checkpoint_minutes", "resume", "out")
+
+
+def resumed_options(opt: Options, argv) -> Options:
+    """The stored options of the run in --out; the command line may change only what keeps the run the same run.
+
+    Raises    UserError: a given option differs from the stored one
+    Test      tests/test_ppo.py::test_resume_refuses_other_options
+    """
+    stored = read_config(opt.out)["config"]
+    given = {a.split("=")[0].lstrip("-").replace("-", "_") for a in argv if a.startswith("--")}
+    values = {}
+    for f in fields(Options):
+        value = stored.get(f.name, getattr(opt, f.name))
+        value = tuple(value) if isinstance(value, list) else value
+        if f.name in given and getattr(opt, f.name) != value:
+            if f.name not in CHANGEABLE:
+                raise UserError(f"{opt.out}: was started with --{f.name} {value}; to resume, leave it out (can change: {', '.join(CHANGEABLE[:3])})")
+            value = getattr(opt, f.name)
+        values[f.name] = value
+    return Options(**values | {"resume": True, "out": opt.out})
+
+
+class StopFlag:
+    """Ctrl-C or SIGTERM ends the run after the present update, with a checkpoint; a second one at once."""
+
+    def __enter__(self):
+        self.stop = False
+        self.old = {s: signal.signal(s, self._on) for s in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def _on(self, number, frame):
+        if self.stop:
+            raise KeyboardInterrupt
+        self.stop = True
+
+    def __exit__(self, *_):
+        for s, handler in self.old.items():
+            signal.signal(s, handler)
+
+
+def train(opt: Options) -> Trainer:
+    """Run, or resume, a training run.  Test: tests/test_ppo.py::test_resume_is_exact, tests/test_cli.py::test_ppo"""
+    out = Path(opt.out)
+    loaded = latest_checkpoint(out) if opt.resume else None
+    began = time.perf_counter()
+    # The configuration is checked and the motions are read before the folder is made: a typo leaves nothing behind.
+    env = make_env(opt)
+    trainer = Trainer(opt, env)
+    if opt.init and not opt.resume:
+        policy, _ = load_policy(opt.init)
+        check_fits(policy, env, opt.init)
+        if (policy.critic_size, policy.hidden, policy.value_hidden) != (env.critic_size, trainer.policy.hidden, trainer.policy.value_hidden):
+            raise UserError(f"{opt.init}: its networks are {policy.hidden}, {policy.value_hidden}: give --hidden and --value-hidden to match")
+        trainer.policy.load(policy.arrays())
+        np.maximum(trainer.policy.log_std, np.log(opt.min_sigma), out=trainer.policy.log_std)
+    data = {"fingerprint": fingerprint(env.ref), "sequences": len(env.ref.names), "minutes": len(env.ref) * env.dt / 60}
+    if loaded and loaded[1].get("data", data)["fingerprint"] != data["fingerprint"]:
+        raise UserError(f"{out}: the motions have changed since the run began ({loaded[1]['data']} against {data}); start a new run with --init {out}")
+    open_run(out, asdict(opt) | {"data": data}, opt.resume)
+    if loaded:
+        trainer.restore(*loaded)
+    else:
+        trainer.start()
+    metrics = Metrics(out / METRICS, loaded[1]["rows"] if loaded else None)
+    meta = {"options": asdict(opt), "data": data}
+    progress = Progress(opt.steps, trainer.steps)
+    print(
+        f"{env.char.name}: {env.obs_size} observations ({env.critic_size} for the critic), {env.action_size} torques, {len(env.ref.names)} sequences, "
+        f"{data['minutes']:.1f} min; policy {trainer.policy.actor.n_params:,} and critic {trainer.policy.critic.n_params:,} weights; ready in {time.perf_counter() - began:.1f} s"
+    )
+    saved = time.perf_counter()
+    with StopFlag() as flag:
+        while trainer.steps < opt.steps and not flag.stop:
+            t0 = time.perf_counter()
+            stats = trainer.collect()
+            t1 = time.perf_counter()
+            stats |= trainer.update()
+            t2 = time.perf_counter()
+            stats |= {"steps_per_s": opt.horizon * env.n / (t2 - t0), "collect_s": t1 - t0, "update_s": t2 - t1}
+            metrics.append({"update": trainer.updates, "steps": trainer.steps} | stats)
+            progress.update(trainer.steps, progress_line(stats))
+            if t2 - saved >= 60 * opt.checkpoint_minutes:
+                trainer.save(out / CHECKPOINT, meta | {"rows": metrics.rows})
+                saved = t2
+    trainer.save(out / CHECKPOINT, meta | {"rows": metrics.rows})
+    metrics.close()
+    if flag.stop:
+        print(f"stopped at {fmt_count(trainer.steps)} steps; continue with: python ppo.py --resume --out {out}")
+    return trainer
+
+
+def progress_line(s) -> dict:
+    """The numbers a watcher needs, short."""
+    terms = " ".join(f"{t} {s[f'r_{t}']:.2f}" for t in TERMS if s[f"r_{t}"])
+    ends = " ".join(f"{e} {s[f'end_{e}']}" for e in Env.ENDS if s[f"end_{e}"])
+    return {
+        "steps/s": f"{s['steps_per_s']:.0f}",
+        "fails every": f"{s['time_to_failure']:.2f} s",
+        "survival": f"{s['survival']:.2f}",
+        "return": f"{s['reward']:.2f}",
+        "[": f"{terms} ]",
+        "ends": ends or "none",
+        "kl": f"{s['kl']:.3f}",
+        "clip": f"{s['clip_fraction']:.2f}",
+        "ev": f"{s['explained_variance']:.2f}",
+        "σ": f"{s['sigma']:.3f}",
+    }
+
+
+def main(argv=None):
+    opt = cli(Options, argv, "ppo.py", __doc__)
+    opt = replace(opt, out=opt.out or f"runs/{Path(opt.character).stem}")
+    if opt.resume:
+        opt = resumed_options(opt, argv)
+    train(opt)
+
+
+if __name__ == "__main__":
+    run_main(main)

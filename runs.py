@@ -1,0 +1,518 @@
+"""What every long run shares: command line, run folder, checkpoints, metrics, progress.
+
+A run is one folder:
+
+    config.json           what was asked for, and the versions and commit that ran it
+    checkpoint.npz        the newest state; checkpoint.prev.npz is the one before
+    metrics.csv           one row per update, cut back to the checkpoint on resume
+
+Every file is written to a temporary name and renamed, so a run killed at any moment resumes from its last good
+checkpoint. NumPy's BLAS starts threads of its own: where the physics is threaded too, set OMP_NUM_THREADS=1 in the
+shell before Python starts, or they compete for the same cores.
+"""
+
+import argparse
+import contextlib
+import csv
+import dataclasses
+import difflib
+import fnmatch
+import io
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+import types
+import typing
+import zipfile
+import zlib
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+CHECKPOINT, PREVIOUS, CONFIG, METRICS = "checkpoint.npz", "checkpoint.prev.npz", "config.json", "metrics.csv"
+
+
+class UserError(Exception):
+    """Bad input from outside. The message names the file, flag or value, and what would have been valid."""
+
+
+def run_main(main_fn, argv=None):
+    """Call main_fn(argv), then exit: its own int, or 2 for a UserError (one line on stderr), or 130 if interrupted."""
+    try:
+        code = main_fn(sys.argv[1:] if argv is None else argv)
+    except UserError as error:
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        code = 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        code = 130
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+# ---- command line ---------------------------------------------------------------------------------------------------
+
+POSITIVE = (lambda v: np.isfinite(v) and v > 0, "greater than 0")
+NONNEGATIVE = (lambda v: np.isfinite(v) and v >= 0, "0 or greater")
+UNIT = (lambda v: 0 <= v <= 1, "from 0 to 1")
+ALL_POSITIVE = (lambda v: len(v) > 0 and all(x > 0 for x in v), "one or more numbers greater than 0, as in 256,128")
+
+
+def arg(default, help, choices=None, flag=None, check=None, metavar=None):
+    """Declare one dataclass field that is also a command-line flag.
+
+    Args      default : value; None needs an annotation such as `int | None`
+              help : str; choices : valid values, or None for any; metavar : str shown in --help
+              flag : "--x"; by default the field's name with dashes
+              check : (test, text), where test(value) -> bool and text is the valid range, e.g. POSITIVE
+    Returns   dataclasses.field
+    Test      tests/test_runs.py::test_cli_reads_every_kind
+    """
+    settings = {"help": help, "choices": choices, "flag": flag, "check": check, "metavar": metavar}
+    return dataclasses.field(default=default, metadata=settings)
+
+
+def cli(dataclass_type, argv, prog, description):
+    """Parse argv into one instance of dataclass_type, whose fields are declared with `arg`.
+
+    `learning_rate` is read from --learning-rate or --learning_rate, a bool from --x or --no-x, a tuple from 256,128;
+    an integer may be written 1e6, and an optional value `none`. --help prints every default.
+
+    Args      dataclass_type : class; argv : list of str; prog, description : str
+    Returns   dataclass_type
+    Raises    SystemExit: 0 after --help; 2 after one line about an unknown flag or a bad value
+    Test      tests/test_runs.py::test_cli_reads_every_kind, test_cli_refuses
+    """
+    parser = argparse.ArgumentParser(prog=prog, description=description, allow_abbrev=False)
+    parser.error = lambda message: parser.exit(2, f"{prog}: error: {message} (see --help)\n")
+    hints, fields = typing.get_type_hints(dataclass_type), dataclasses.fields(dataclass_type)
+    flags = {f.name: f.metadata.get("flag") or "--" + f.name.replace("_", "-") for f in fields}
+    for f in fields:
+        if f.default is dataclasses.MISSING:
+            raise TypeError(f"{dataclass_type.__name__}.{f.name} needs a default: declare it with arg(default, help)")
+        read, choices = _reader(hints[f.name]), f.metadata.get("choices")
+        if read is bool:
+            how = {"action": argparse.BooleanOptionalAction}
+        else:
+            how = {"type": read, "choices": choices}
+            how["metavar"] = f.metadata.get("metavar") or (None if choices else read.__name__.upper())
+        action = parser.add_argument(flags[f.name], dest=f.name, default=f.default, **how)
+        action.help = f"{f.metadata.get('help', '')} (default: {_shown(f.default)})".replace("%", "%%")
+    argv = [_dashed(a) for a in argv]
+    values, unknown = parser.parse_known_args(argv)
+    if unknown:
+        near = difflib.get_close_matches(unknown[0].split("=")[0], list(parser._option_string_actions), 1)
+        parser.error(f"unknown argument {unknown[0]}" + (f"; did you mean {near[0]}?" if near else ""))
+    for f in fields:
+        check, value = f.metadata.get("check"), getattr(values, f.name)
+        if check and value is not None and not check[0](value):
+            parser.error(f"argument {flags[f.name]}: {_shown(value)} is not valid; it must be {check[1]}")
+    return dataclass_type(**vars(values))
+
+
+def _dashed(a):
+    """--some_flag=a_b -> --some-flag=a_b; anything else unchanged."""
+    name, equals, value = a.partition("=")
+    return name.replace("_", "-") + equals + value if a.startswith("--") else a
+
+
+def _shown(value):
+    """A value as it would be typed on the command line."""
+    if isinstance(value, tuple | list):
+        return ",".join(str(v) for v in value)
+    return "none" if value is None else str(value)
+
+
+def _reader(hint):
+    """The function that reads one flag's text, from the field's annotation."""
+    optional = False
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        optional = True
+        hint = next(a for a in typing.get_args(hint) if a is not type(None))
+    if hint is bool:
+        return bool
+    inner = typing.get_args(hint)[0] if typing.get_origin(hint) in (tuple, list) else hint
+    many = inner is not hint or hint is tuple
+    inner = int if inner is tuple else inner
+
+    def read(text):
+        if optional and text.lower() == "none":
+            return None
+        if many:
+            return tuple(_number(inner, part.strip()) for part in text.split(",") if part.strip())
+        return _number(hint, text)
+
+    read.__name__ = ("comma-separated " if many else "") + getattr(inner, "__name__", "str").lower()
+    return read
+
+
+def _number(kind, text):
+    """kind(text), where an int may also be written 1e6."""
+    if kind is int:
+        try:
+            return int(text)
+        except ValueError:
+            if float(text).is_integer():
+                return int(float(text))
+            raise
+    return kind(text)
+
+
+# ---- files that are whole or absent ---------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def atomic_path(path, previous=None):
+    """Yield a temporary path beside `path` (same suffix); rename it on success, remove it on any exception.
+
+    Args      path : the final file; previous : where an existing file is kept, or None to replace it
+    Test      tests/test_runs.py::test_atomic_write
+    """
+    path = Path(path)
+    temporary = path.with_name(f"{path.stem}.tmp-{os.getpid()}-{os.urandom(3).hex()}{path.suffix}")
+    try:
+        yield temporary
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        if previous is not None and path.exists():
+            os.replace(path, previous)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def atomic_write(path, content, previous=None):
+    """Write a whole file or none of it.
+
+    Args      path : final file; content : bytes, str, or a function that is given the open binary file
+              previous : where an existing file is kept, or None
+    Raises    UserError: the folder is missing or cannot be written
+    Test      tests/test_runs.py::test_atomic_write
+    """
+    try:
+        with atomic_path(path, previous) as temporary, open(temporary, "wb") as file:
+            if callable(content):
+                content(file)
+            else:
+                file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(f"cannot write {path}: {reason}; give a folder that exists and is writable") from None
+
+
+# ---- run folder -----------------------------------------------------------------------------------------------------
+
+
+def versions():
+    """What a number depends on beside the code: interpreter, libraries, machine."""
+    found = {"python": platform.python_version()}
+    for name in ("numpy", "scipy", "mujoco"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = None
+    return found | {"platform": platform.platform(), "cpus": os.cpu_count()}
+
+
+def git_state(folder=None):
+    """{"commit": hash or None, "dirty": bool or None} of the repository that holds `folder` (default: this file)."""
+
+    def git(*words):
+        where = str(folder or Path(__file__).resolve().parent)
+        return subprocess.run(["git", "-C", where, *words], capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        commit = git("rev-parse", "HEAD")
+        return {"commit": commit, "dirty": bool(git("status", "--porcelain", "--untracked-files=no"))}
+    except (OSError, subprocess.CalledProcessError):
+        return {"commit": None, "dirty": None}
+
+
+def open_run(out, config, resume=False):
+    """Create the run folder, or reopen it to resume, and write config.json.
+
+    On resume the earlier launches stay in config.json under "earlier", and temporary leftovers are removed.
+
+    Args      out : folder; config : dict or dataclass; resume : bool
+    Returns   Path of the folder
+    Raises    UserError: a run is there already and resume is False; or none is there and resume is True
+    Test      tests/test_runs.py::test_open_run
+    """
+    out = Path(out)
+    there = any((out / name).exists() for name in (CONFIG, CHECKPOINT, PREVIOUS, METRICS))
+    if there and not resume:
+        raise UserError(f"{out} already holds a run: add --resume to continue it, or choose another folder")
+    if resume and not there:
+        raise UserError(f"{out} holds no run to resume: leave out --resume, or name a folder that has {CONFIG}")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot create the run folder {out}: {error.strerror}") from None
+    for leftover in out.glob("*.tmp-*"):
+        leftover.unlink(missing_ok=True)
+    earlier = []
+    if resume and (out / CONFIG).exists():
+        last = read_config(out)
+        earlier = last.pop("earlier", []) + [last]
+    config = dataclasses.asdict(config) if dataclasses.is_dataclass(config) else dict(config)
+    record = {"config": config, "versions": versions(), "git": git_state(), "earlier": earlier}
+    atomic_write(out / CONFIG, json.dumps(record, indent=2, sort_keys=True, default=_plain) + "\n")
+    return out
+
+
+def read_config(folder):
+    """The record in folder/config.json: {"config", "versions", "git", "earlier"}; UserError if it is unreadable."""
+    path = Path(folder) / CONFIG
+    try:
+        record = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {path} ({error}): a run folder has the {CONFIG} that the run wrote") from None
+    if not isinstance(record, dict) or not isinstance(record.get("config"), dict):
+        raise UserError(f'{path} has no "config" table: a run folder has the {CONFIG} that the run wrote')
+    return record
+
+
+def _plain(value):
+    """What json.dumps cannot write itself: NumPy scalars and arrays, paths."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} cannot be written as JSON")
+
+
+# ---- checkpoints ----------------------------------------------------------------------------------------------------
+
+UNREADABLE = (OSError, EOFError, ValueError, KeyError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
+
+
+def save_checkpoint(path, arrays, meta):
+    """Write arrays and meta to one .npz, whole or not at all.
+
+    A file named checkpoint.npz moves to checkpoint.prev.npz first; any other name is replaced.
+
+    Args      path : file; arrays : dict of name -> array, no objects; meta : dict that JSON can hold
+    Raises    ValueError: an object array, or the name __meta__; UserError: the folder cannot be written
+    Test      tests/test_runs.py::test_checkpoint_round_trip, test_killed_while_writing
+    """
+    path = Path(path)
+    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    for name, value in arrays.items():
+        if value.dtype.hasobject or name == "__meta__":
+            raise ValueError(f"array {name!r} ({value.dtype}) cannot be saved: use numbers, and a name but __meta__")
+    text = json.dumps(meta, default=_plain).encode()
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, value in (arrays | {"__meta__": np.frombuffer(text, np.uint8)}).items():
+            with archive.open(zipfile.ZipInfo(name + ".npy"), "w", force_zip64=True) as member:  # a fixed date: 1980
+                np.lib.format.write_array(member, value, allow_pickle=False)
+    atomic_write(path, buffer.getvalue(), path.with_name(PREVIOUS) if path.name == CHECKPOINT else None)
+
+
+def load_checkpoint(path, finite=()):
+    """Read what save_checkpoint wrote.
+
+    Args      path : file; finite : names or patterns ("policy.*") that must be there and hold no NaN or infinity
+    Returns   arrays : dict of name -> array; meta : dict
+    Raises    UserError: missing, cut short, not a checkpoint, object arrays, or non-finite numbers
+    Test      tests/test_runs.py::test_checkpoint_round_trip, test_damaged_checkpoints
+    """
+    expected = f"a checkpoint is an .npz file that save_checkpoint wrote (such as {CHECKPOINT} in a run folder)"
+    if not Path(path).is_file():
+        raise UserError(f"no checkpoint {path}: {expected}")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        meta = json.loads(arrays.pop("__meta__").tobytes())
+    except (*UNREADABLE, AttributeError, TypeError) as error:
+        detail = "no __meta__ entry" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
+        raise UserError(f"cannot read checkpoint {path} ({detail}): {expected}") from None
+    if not isinstance(meta, dict):
+        raise UserError(f"cannot read checkpoint {path} (its __meta__ is no table): {expected}")
+    for pattern in finite:
+        names = fnmatch.filter(arrays, pattern)
+        if not names:
+            raise UserError(f"checkpoint {path} has no array {pattern!r}; it has: {', '.join(sorted(arrays))}")
+        for name in names:
+            if arrays[name].dtype.kind in "fc" and not np.isfinite(arrays[name]).all():
+                raise UserError(f"checkpoint {path}: array {name!r} holds NaN or infinity; use an earlier checkpoint")
+    return arrays, meta
+
+
+def latest_checkpoint(folder, finite=()):
+    """Load the newest readable checkpoint of a run folder.
+
+    Falls back to checkpoint.prev.npz, with a printed note, when the newest is missing or damaged.
+
+    Returns   (arrays, meta), or None when the run wrote no checkpoint yet
+    Raises    UserError: there are checkpoints and none is readable
+    Test      tests/test_runs.py::test_latest_falls_back
+    """
+    paths = [p for p in (Path(folder) / CHECKPOINT, Path(folder) / PREVIOUS) if p.exists()]
+    for path in paths:
+        try:
+            loaded = load_checkpoint(path, finite)
+        except UserError as error:
+            print(f"note: {error}", file=sys.stderr)
+            failed = error
+            continue
+        if path.name == PREVIOUS:
+            print(f"note: using the previous checkpoint, {path}", file=sys.stderr)
+        return loaded
+    if paths:
+        raise UserError(f"no readable checkpoint in {folder}; last tried: {failed}")
+    return None
+
+
+def rng_state(rng):
+    """A Generator's whole state as JSON-ready numbers, with the seed sequence that `spawn` draws from."""
+    seeds = rng.bit_generator.seed_seq
+    names = ("entropy", "spawn_key", "pool_size", "n_children_spawned")
+    seeds = {name: getattr(seeds, name) for name in names} if isinstance(seeds, np.random.SeedSequence) else None
+    return json.loads(json.dumps({"state": rng.bit_generator.state, "seeds": seeds}, default=_plain))
+
+
+def rng_from_state(state):
+    """The Generator that rng_state described: it draws and spawns exactly what the saved one would have.
+
+    Raises    UserError: not a state that rng_state wrote
+    Test      tests/test_runs.py::test_rng_state_is_exact
+    """
+    kinds = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
+    try:
+        name, seeds = state["state"]["bit_generator"], state["seeds"]
+        if name not in kinds:
+            raise ValueError(f"bit generator {name!r}")
+        seeds = None if seeds is None else np.random.SeedSequence(**{**seeds, "spawn_key": tuple(seeds["spawn_key"])})
+        bits = getattr(np.random, name)(seeds)
+        bits.state = _like(bits.state, state["state"])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise UserError(f"not a saved random state ({error}): valid generators are {', '.join(kinds)}") from None
+    return np.random.Generator(bits)
+
+
+def _like(template, value):
+    """`value` from JSON, with lists turned back into the arrays that `template` has."""
+    if isinstance(template, dict):
+        return {key: _like(template[key], value[key]) for key in template}
+    return np.array(value, template.dtype) if isinstance(template, np.ndarray) else value
+
+
+# ---- metrics and progress -------------------------------------------------------------------------------------------
+
+
+class Metrics:
+    """metrics.csv, one row per update; every row reaches the disk's cache at once.
+
+    Args      path : file
+              resume_row : rows to keep, i.e. how many were written when the checkpoint was saved (store `.rows` in its
+                  meta); the rest is dropped, so the file continues exactly. None starts a new file.
+    Test      tests/test_runs.py::test_metrics_resume
+    """
+
+    def __init__(self, path, resume_row=None):
+        self.path, self.header, self.rows = Path(path), None, 0
+        lines = []
+        if resume_row is not None and self.path.exists():
+            lines = _whole_lines(self.path)[: resume_row + 1]
+            self.header, self.rows = (lines[0] if lines else None), max(len(lines) - 1, 0)
+            if self.rows < resume_row:
+                print(f"note: {path} has {self.rows} of the checkpoint's {resume_row} rows", file=sys.stderr)
+        atomic_write(self.path, "".join(_csv(line) for line in lines))
+        self.file = open(self.path, "a", newline="")
+
+    def append(self, row):
+        """Add one row, a dict of name -> number; every row has the same names. ValueError otherwise."""
+        if self.header is None:
+            self.header = list(row)
+            self.file.write(_csv(self.header))
+        if list(row) != self.header:
+            odd = sorted(set(row) ^ set(self.header)) or "the order of the names"
+            raise ValueError(f"{self.path}: the row differs from the header in {odd}; valid: {self.header}")
+        self.file.write(_csv([_plain(v) if isinstance(v, np.ndarray | np.generic) else v for v in row.values()]))
+        self.file.flush()
+        self.rows += 1
+
+    def close(self):
+        self.file.close()
+
+
+def read_metrics(path):
+    """metrics.csv as name -> (rows,) float64; an unfinished last line is left out, an empty cell is NaN.
+
+    Raises    UserError: no such file, or a cell that is no number
+    Test      tests/test_runs.py::test_metrics_resume
+    """
+    lines = _whole_lines(path)
+    header, rows = (lines[0], lines[1:]) if lines else ([], [])
+    columns = {name: np.empty(len(rows)) for name in header}
+    for i, row in enumerate(rows):
+        for name, cell in zip(header, row, strict=True):
+            try:
+                columns[name][i] = float(cell) if cell else np.nan
+            except ValueError:
+                raise UserError(f"{path} line {i + 2}, column {name}: {cell!r} is not a number") from None
+    return columns
+
+
+def _whole_lines(path):
+    """The complete rows of a CSV file, header first."""
+    try:
+        text = Path(path).read_text()
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {path}: {error}; give the {METRICS} of a run") from None
+    lines = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1])))
+    for i, line in enumerate(lines):
+        if len(line) != len(lines[0]):
+            raise UserError(f"{path} line {i + 1} has {len(line)} cells; the header has {len(lines[0])}")
+    return lines
+
+
+def _csv(cells):
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(cells)
+    return text.getvalue()
+
+
+class Progress:
+    """One line per update: share done, the numbers given, time spent and time left.
+
+    Args      total : amount of work; start : work done before this launch; unit : its name; stream : None is stdout
+    Test      tests/test_runs.py::test_progress
+    """
+
+    def __init__(self, total, start=0, unit="steps", stream=None):
+        self.total, self.start, self.unit, self.stream = total, start, unit, stream
+        self.began = time.perf_counter()
+
+    def line(self, done, values):
+        """The text for `done` work and `values`, an ordered dict of name -> formatted text."""
+        spent, fresh = time.perf_counter() - self.began, done - self.start
+        left = fmt_time(spent * (self.total - done) / fresh) if fresh > 0 else "?"
+        head = f"{100 * done / max(self.total, 1):5.1f}% {fmt_count(done)}/{fmt_count(self.total)} {self.unit}"
+        return "  ".join([head, *(f"{k} {v}" for k, v in values.items()), f"{fmt_time(spent)} spent, {left} left"])
+
+    def update(self, done, values):
+        """Print that line."""
+        print(self.line(done, values), file=self.stream or sys.stdout, flush=True)
+
+
+def fmt_time(seconds):
+    """Seconds as 42s, 3m07s, 2h05m or 1d03h."""
+    s = max(round(seconds), 0)
+    for big, small, unit, sub in ((86400, 3600, "d", "h"), (3600, 60, "h", "m"), (60, 1, "m", "s")):
+        if s >= big:
+            return f"{s // big}{unit}{s % big // small:02d}{sub}"
+    return f"{s}s"
+
+
+def fmt_count(n):
+    """A count as 950, 12.3k, 1.2M or 3.4G."""
+    for scale, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(n) >= scale:
+            return f"{n / scale:.1f}{unit}"
+    return str(round(n))

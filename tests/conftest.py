@@ -1,0 +1,28 @@
+"""What every test shares: the repository on the path, software pictures, and the folder of recorded motion."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+if "MUJOCO_GL" not in os.environ and "DISPLAY" not in os.environ:
+    import render
+
+    name = render.gl_backend()
+    if name:
+        os.environ["MUJOCO_GL"] = name
+
+
+@pytest.fixture(scope="session")
+def mocap_dir():
+    """The folder of recorded motion that MOCAP_DIR names; the test is skipped without it."""
+    name = os.environ.get("MOCAP_DIR")
+    if not name:
+        pytest.skip("MOCAP_DIR is not set: name a folder of recorded motion to run this test")
+    if not Path(name).is_dir():
+        pytest.fail(f"MOCAP_DIR={name} is not a folder")
+    return Path(name)
