@@ -16,7 +16,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from mocap import CONTROL_RATE, heading, quat_angle
+from mocap import heading, quat_angle
 from retarget import STAGE_VEL, TERMS, Character, Reference, body_velocity, geom_lowest
 from runs import rng_from_state, rng_state
 
@@ -25,7 +25,7 @@ FORCE_LIMIT = 1.0  # N  [Reda23 App. A]
 EPISODE_STEPS = 500  # [Reda23 §3.6]
 SUBSTEPS = 4  # ASSUMED: 1/120 s physics at 30 Hz control (feasibility: 1/60 s does not learn)
 FUTURES = (1, 5, 15)  # ASSUMED: future frames shown to the critic, in control steps
-BAD = [int(w) for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)]
+BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
 USER_SIZE = 3 * (3 + 6)
 
 # ------------------------------------------------------------------------------------ observation
@@ -35,8 +35,9 @@ class HeadingFrame:
     r"""The frame of every observation: on the floor below the root, turned with the root's heading  [Reda23 §3.3].
 
     Equation  p' = R_z(−ψ) (p − (x_root, y_root, 0)),  R' = R_z(−ψ) R
-    Args      root_pos (N, 3), root_quat (N, 4), world
-    Test      tests/test_env.py::test_heading_invariance
+    Symbols   ψ = `mocap.heading`, of the body's left axis: does not flip when it bends over (design.md, mistake 6)
+    Args      root_pos (N, 3) [m], root_quat (N, 4) w, x, y, z, world
+    Test      tests/test_env.py::test_heading_invariance, test_observation_terms
     """
 
     def __init__(self, root_pos, root_quat):
@@ -75,8 +76,10 @@ def observe_user(frame: HeadingFrame, pos, rot, out):
 def observe_sim(frame: HeadingFrame, qpos, qvel, spin, link_pos, link_rot, out):
     r"""Character part of the observation  [Reda23 Eq. 3]: o_sim = [q, q̇, x, R].
 
-    ASSUMED   q̇ of the root (its linear and angular velocity, turned into the frame) leads q̇; q of the root is in x and R.
-    Args      qpos (N, 7+j), qvel (N, 6+j), spin (N, 3) root angular velocity, world; link_pos (N, l, 3); link_rot (N, l, 3, 2)
+    ASSUMED   q̇ of the root (its linear and angular velocity, turned into the frame) leads q̇; q of the root is in
+              x and R
+    Args      qpos (N, 7+j), qvel (N, 6+j); spin (N, 3) [rad/s] root angular velocity, world;
+              link_pos (N, l, 3) [m], link_rot (N, l, 3, 2) first two columns of the rotations, world
               out (N, j + 6 + j + 9 l)
     Test      tests/test_env.py::test_observation_terms
     """
@@ -92,7 +95,7 @@ def observe_sim(frame: HeadingFrame, qpos, qvel, spin, link_pos, link_rot, out):
 
 
 def observation_terms(char: Character) -> dict:
-    """Name -> size, in the order of the vector; the actor's [Eq. 2] first, then the critic's.
+    """{"actor": {name: size}, "critic": {name: size}}, in the order of the vector: the actor's [Eq. 2] first.
 
     ASSUMED   o_{t-1,user} is expressed in the frame of time t, so that its difference to o_{t,user} is a velocity.
     Test      tests/test_env.py::test_observation_terms"""
@@ -106,7 +109,9 @@ def observation_terms(char: Character) -> dict:
 
 
 def kernel(w, k, d):
-    r"""[Reda23 Eq. 8] r(s) = w_s exp(−k_s d(s_sim, s_kin)).  d (N,) -> (N,).  Test: tests/test_env.py::test_reward_terms"""
+    r"""[Reda23 Eq. 8] r(s) = w_s exp(−k_s d(s_sim, s_kin)).  d (N,) -> (N,).
+
+    Test      tests/test_env.py::test_reward_terms"""
     return w * np.exp(-k * d)
 
 
@@ -164,8 +169,9 @@ def reward_contact(w, k, c_sim, c_human):
 
 
 def reward_action_diff(w, k, a_prev, a):
-    r"""[Reda23 Eq. 9] d = (1/N) Σ_i (a_{t−1,i} − a_{t,i})².  Actions (N, u) as the physics gets them: clipped (ASSUMED).
+    r"""[Reda23 Eq. 9] d = (1/N) Σ_i (a_{t−1,i} − a_{t,i})².
 
+    ASSUMED   the actions (N, u) are those that the physics gets: clipped
     Test      tests/test_env.py::test_reward_terms"""
     return kernel(w, k, np.square(a_prev - a).mean(-1))
 
@@ -190,12 +196,16 @@ def total_reward(terms: dict):
 
 
 def fallen(fall_height):
-    """[Reda23 §3.6] the upper body touches the ground.  fall_height (N,) [m].  Test: tests/test_env.py::test_termination"""
+    """[Reda23 §3.6] the upper body touches the ground: its lowest point, fall_height (N,) [m], is not above the floor.
+
+    Test      tests/test_env.py::test_fall_is_contact"""
     return fall_height <= 0.0
 
 
 def too_far(root_pos, root_target):
-    """[Reda23 §3.6] the root is more than 0.30 m from the scaled mocap root, in 3-D (ASSUMED).  Test: tests/test_env.py::test_termination"""
+    """[Reda23 §3.6] the root is more than 0.30 m from the scaled mocap root, both (N, 3), in 3-D (ASSUMED).
+
+    Test      tests/test_env.py::test_termination"""
     return np.linalg.norm(root_pos - root_target, axis=-1) > ROOT_LIMIT
 
 
@@ -205,24 +215,37 @@ def too_far(root_pos, root_target):
 class Env:
     """N characters following random places of a reference  [Reda23 §3.6].
 
-    As Gymnasium's vector environments with autoreset in the same step: `step` returns the observation of the new episode where one
-    ended, and info["final_obs"] the observation it ended with.
+    As Gymnasium's vector environments with autoreset in the same step: `step` returns the observation of the new
+    episode where one ended, and info["final_obs"] the observation it ended with.
 
-    char, ref : `retarget.character`, `retarget.reference`
+    char, ref : `retarget.character`, `retarget.reference`; control runs at the reference's rate
     n         : number of environments
     threads   : physics threads, 0 = all cores; results do not depend on it
     horizon   : control steps to truncation
+    autoreset : start anew where an episode ended; without it the caller resets, and reads the state that ended
     """
 
     ENDS = ("fall", "far", "bad", "time", "clip")  # why an episode ends: three failures, two truncations
 
-    def __init__(self, char: Character, ref: Reference, n: int, seed=0, threads=0, horizon=EPISODE_STEPS, rate=CONTROL_RATE, substeps=SUBSTEPS):
+    def __init__(
+        self,
+        char: Character,
+        ref: Reference,
+        n: int,
+        seed=0,
+        threads=0,
+        horizon=EPISODE_STEPS,
+        substeps=SUBSTEPS,
+        autoreset=True,
+    ):
         self.char, self.ref, self.n, self.horizon, self.substeps = char, ref, n, horizon, substeps
-        self.dt = 1.0 / rate
+        self.dt = 1.0 / ref.rate
+        self.autoreset = autoreset
         char.model.opt.timestep = self.dt / substeps
         self.batch = char.batch(n, threads)
         bind = self.batch.bind
-        self.qpos, self.qvel, self.ctrl, self.warmstart = bind("qpos"), bind("qvel"), bind("ctrl"), bind("qacc_warmstart")
+        self.qpos, self.qvel, self.ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
+        self.warmstart = bind("qacc_warmstart")
         self.xpos, self.xmat, self.xquat = bind("xpos"), bind("xmat"), bind("xquat")
         self.cvel, self.com, self.sensordata = bind("cvel"), bind("subtree_com"), bind("sensordata")
         self.geom_xpos, self.geom_xmat = bind("geom_xpos"), bind("geom_xmat")
@@ -249,10 +272,18 @@ class Env:
     # ---- reset
 
     def reset(self, seed: int | None = None, frames=None):
-        """Start all environments, at random reference frames or at the given ones (N,).  -> obs (N, obs_size), info
+        """Start all environments, at random reference frames or at the given ones.
 
+        Args      seed : starts the random numbers anew; frames : (N,) int, none the last of its sequence
+        Returns   obs (N, obs_size) float32, info with "critic" (N, critic_size); views, as in `step`
+        Raises    ValueError: a frame without a successor, or not one frame an environment
         Test      tests/test_env.py::test_reset_reproduces_reference
         """
+        if frames is not None:
+            ok = np.isin(frames, np.arange(len(self.ref))) & ~np.isin(frames, self.ref.last)
+            if np.shape(frames) != (self.n,) or not ok.all():
+                most = len(self.ref) - 1
+                raise ValueError(f"frames {frames!r}: expected {self.n} of 0..{most}, none the last of a sequence")
         if seed is not None:
             self.rng = np.random.default_rng(seed)
         self._reset(np.arange(self.n), frames)
@@ -271,29 +302,36 @@ class Env:
     # ---- step
 
     def step(self, action):
-        """Advance one control step.  action (N, u): unclipped, as the policy drew it.
+        """Advance one control step.
 
+        Args      action : (N, u) unclipped, as the policy drew it
         Returns   obs (N, obs_size) float32, reward (N,), terminated (N,), truncated (N,) bool, info:
                   critic       : (N, critic_size) observation and privileged part
                   final_obs, final_critic, _final_obs : the same before the reset, and where they hold
                   length, available : (N,) control steps lived, and that could have been lived
-                  terms        : name -> (N,) reward term; ends : name -> (N,) bool
-        Raises    ValueError: an action is not finite
+                  terms        : name -> (N,) reward term, 0 where the state was bad; ends : name -> (N,) bool
+                  obs and critic are views of `full`, which the next step overwrites: copy what you keep
+        Raises    ValueError: an action is not finite, or not one row an environment
         Test      tests/test_env.py::test_step_contract
         """
+        if np.shape(action) != self.action.shape:
+            raise ValueError(f"action has shape {np.shape(action)}, expected {self.action.shape}")
+        if not np.isfinite(action).all():
+            raise ValueError(f"action of environment {int(np.argmin(np.isfinite(action).all(1)))} is not finite")
         a = np.clip(action, -1.0, 1.0)  # only the physics sees clipped actions (design.md, mistake 3)
-        if not np.isfinite(a).all():
-            raise ValueError(f"action of environment {int(np.argmin(np.isfinite(a).all(1)))} is not finite")
         self.ctrl[:] = a
         self.batch.step(nstep=self.substeps, stage=STAGE_VEL)
-        self.frame += 1
+        self.frame = np.minimum(self.frame + 1, self.ref.last[self.sequence])  # without autoreset the last frame stays
         self.steps += 1
         bad = self._recover()
         f = self.frame
         self.contact = self._contact()
         terms = self.reward_terms(a)
+        if bad.any():
+            terms = {name: np.where(bad, 0.0, value) for name, value in terms.items()}
+        lowest = geom_lowest(self.char.model, self.char.fall_geoms, self.geom_xpos, self.geom_xmat).min(1)
         ends = dict(
-            fall=fallen(geom_lowest(self.char.model, self.char.fall_geoms, self.geom_xpos, self.geom_xmat).min(1)) & ~bad,
+            fall=fallen(lowest) & ~bad,
             far=too_far(self.qpos[:, :3], self.ref.qpos[f, :3]) & ~bad,
             bad=bad,
         )
@@ -302,11 +340,12 @@ class Env:
         ends["clip"] = (f >= self.ref.last[self.sequence]) & ~terminated
         ends["time"] = (self.steps >= self.horizon) & ~terminated & ~ends["clip"]
         truncated = ends["clip"] | ends["time"]
-        reward = np.where(bad, 0.0, total_reward(terms)) + np.where(terminated, self.char.reward["fail"], 0.0)
+        reward = total_reward(terms) + np.where(terminated, self.char.reward["fail"], 0.0)
         self.action[:] = a
         self._observe(slice(None))
-        done = np.flatnonzero(terminated | truncated)
-        info = {"terms": terms, "ends": ends, "_final_obs": terminated | truncated, "length": self.steps.copy(), "available": self.available.copy()}
+        done = np.flatnonzero(terminated | truncated) if self.autoreset else ()
+        info = {"terms": terms, "ends": ends, "_final_obs": terminated | truncated}
+        info |= {"length": self.steps.copy(), "available": self.available.copy()}
         if len(done):
             info["final_critic"] = self.full.copy()
             info["final_obs"] = info["final_critic"][:, : self.obs_size]
@@ -316,9 +355,12 @@ class Env:
         return self.full[:, : self.obs_size], reward, terminated, truncated, info
 
     def _recover(self):
-        """Environments whose state is not finite, or that MuJoCo had to reset: put back on the reference, ended as failures, so that
-        nothing non-finite reaches the networks (design.md, mistake 11).  -> (N,) bool"""
-        bad = ~(np.isfinite(self.qpos).all(1) & np.isfinite(self.qvel).all(1)) | (self.batch.warning[:, BAD, 1] > 0).any(1)
+        """Environments whose state is not finite, or that MuJoCo had to reset: put back on the reference, ended as
+        failures, so that nothing non-finite reaches the networks (design.md, mistake 11).  -> (N,) bool
+
+        Test      tests/test_env.py::test_bad_state_ends_alone"""
+        bad = ~(np.isfinite(self.qpos).all(1) & np.isfinite(self.qvel).all(1))
+        bad |= (self.batch.warning[:, BAD, 1] > 0).any(1)
         if bad.any():
             ids = np.flatnonzero(bad)
             self.batch.warning[ids] = 0
@@ -328,11 +370,15 @@ class Env:
         return bad
 
     def _contact(self):
-        """Feet whose normal force on the floor exceeds 1 N during the last substep.  (N, 2) bool"""
+        """Feet whose normal force on the floor exceeds 1 N during the last substep.  (N, 2) bool
+
+        Test      tests/test_env.py::test_contact_forces"""
         return np.abs(self.sensordata[:, self.char.contact_adr]) > FORCE_LIMIT
 
     def reward_terms(self, a) -> dict:
-        """Every term of Eqs. 5 to 7 at the present state, by name; a term of weight 0 is 0.  a (N, u) clipped."""
+        """Every term of Eqs. 5 to 7 at the present state, by name; a term of weight 0 is 0.  a (N, u) clipped.
+
+        Test      tests/test_env.py::test_reward_terms, test_zero_weight_adds_nothing"""
         c, ref, f, r = self.char, self.ref, self.frame, self.char.reward
         links = c.reward_links
         values = dict(
@@ -348,7 +394,9 @@ class Env:
         return {name: values[name](*r[name]) if r[name][0] else np.zeros(self.n) for name in TERMS}
 
     def link_velocity(self):
-        """Linear velocities of the reward links.  (N, l, 3) [m/s], world"""
+        """Linear velocities of the reward links.  (N, l, 3) [m/s], world
+
+        Test      tests/test_env.py::test_kinematics_are_fresh"""
         links = self.char.reward_links
         return body_velocity(self.cvel[:, links], self.xpos[:, links], self.com[:, self.char.root])
 
@@ -366,7 +414,8 @@ class Env:
         rot = self.xmat[ids][:, links].reshape(n, len(links), 3, 3)[..., :2]
         sim = out[:, s["q"].start : s["R"].stop]
         observe_sim(frame, qpos, qvel, self.cvel[ids][:, char.root, :3], self.xpos[ids][:, links], rot, sim)
-        observe_user(frame, ref.sensor_pos[f - 1], ref.sensor_rot[f - 1], out[:, s["user_previous"]])
+        before = np.maximum(f - 1, ref.first[self.sequence[ids]])  # a sequence's first frame has none before it
+        observe_user(frame, ref.sensor_pos[before], ref.sensor_rot[before], out[:, s["user_previous"]])
         observe_user(frame, ref.sensor_pos[f], ref.sensor_rot[f], out[:, s["user"]])
         last = ref.last[self.sequence[ids]]
         frame.place(ref.human_pos[f], out[:, s["human_pos"]].reshape(n, 15, 3))
@@ -380,11 +429,16 @@ class Env:
     # ---- exact resume
 
     def state(self) -> tuple[dict, dict]:
-        """Arrays and JSON that `load_state` continues from bit-exactly.  Test: tests/test_ppo.py::test_resume_is_exact"""
-        arrays = dict(state=self.batch.state, frame=self.frame, steps=self.steps, available=self.available, action=self.action)
-        return {k: v.copy() for k, v in arrays.items()}, {"rng": rng_state(self.rng)}
+        """Arrays and JSON that `load_state` continues from bit-exactly.
+
+        Test      tests/test_env.py::test_state_continues_exactly, tests/test_ppo.py::test_resume_is_exact"""
+        arrays = {k: getattr(self, k).copy() for k in ("frame", "steps", "available", "action")}
+        return {"state": self.batch.state.copy()} | arrays, {"rng": rng_state(self.rng)}
 
     def load_state(self, arrays, meta):
+        """Continue from what `state` returned.  -> obs, info as from `reset`
+
+        Test      tests/test_env.py::test_state_continues_exactly"""
         self.batch.state[:] = arrays["state"]
         self.frame[:], self.steps[:], self.action[:] = arrays["frame"], arrays["steps"], arrays["action"]
         self.available[:] = arrays["available"]

@@ -18,7 +18,8 @@ import argparse
 import re
 import sys
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatch
+from fnmatch import fnmatchcase
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ CONTROL_RATE = 30.0  # Hz, ASSUMED: Table 3 is lost
 
 
 def quat_mul(a, b):
-    """Hamilton product of quaternions w, x, y, z.  a, b : (..., 4) -> (..., 4).  Test: test_mocap.py::test_quaternions."""
+    """Hamilton product of quaternions w, x, y, z, (..., 4) each.  Test: test_mocap.py::test_quaternions."""
     aw, ax, ay, az = np.moveaxis(np.asarray(a), -1, 0)
     bw, bx, by, bz = np.moveaxis(np.asarray(b), -1, 0)
     return np.stack([
@@ -59,7 +60,7 @@ def quat_conj(q):
 
 
 def quat_rotate(q, v):
-    r"""Rotate vectors: v + 2 w (u×v) + 2 u×(u×v), q = (w, u).  q (..., 4), v (..., 3).  Test: test_mocap.py::test_quaternions."""
+    """Rotate vectors v (..., 3) by q = (w, u): v + 2 w (u×v) + 2 u×(u×v).  Test: test_mocap.py::test_quaternions."""
     q, v = np.asarray(q), np.asarray(v)
     u, w = q[..., 1:], q[..., :1]
     t = 2.0 * np.cross(u, v)
@@ -78,7 +79,7 @@ def quat_matrix(q):
 
 
 def quat_about(axis: int, angle):
-    """Quaternion of a turn by `angle` (...) about coordinate axis 0, 1 or 2 -> (..., 4)."""
+    """Turn by `angle` (...) about coordinate axis 0, 1 or 2 -> (..., 4).  Test: test_mocap.py::test_quaternions."""
     angle = np.asarray(angle, dtype=float)
     q = np.zeros(angle.shape + (4,))
     q[..., 0], q[..., 1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
@@ -86,13 +87,13 @@ def quat_about(axis: int, angle):
 
 
 def quat_angle(a, b):
-    r"""Geodesic angle |log(a b⁻¹)| between rotations, in [0, π]; q and −q are one rotation.  Test: test_mocap.py::test_quaternions."""
+    """Geodesic angle |log(a b⁻¹)| in [0, π]; q and −q are one rotation.  Test: test_mocap.py::test_quaternions."""
     r = quat_mul(a, quat_conj(b))
     return 2.0 * np.arctan2(np.linalg.norm(r[..., 1:], axis=-1), np.abs(r[..., 0]))
 
 
 def quat_slerp(a, b, t):
-    """Spherical interpolation along the shorter arc.  a, b (..., 4), t (...) in [0, 1].  Test: test_mocap.py::test_resample."""
+    """Slerp along the shorter arc.  a, b (..., 4), t (...) in [0, 1].  Test: test_mocap.py::test_resample."""
     dot = np.sum(a * b, axis=-1, keepdims=True)
     b, dot = np.where(dot < 0, -b, b), np.minimum(np.abs(dot), 1.0)
     t = np.asarray(t)[..., None]
@@ -106,7 +107,7 @@ def quat_slerp(a, b, t):
 
 
 def quat_continuous(q):
-    """Choose signs so that consecutive frames lie in one hemisphere.  q (T, ..., 4)."""
+    """Signs such that consecutive frames lie in one hemisphere.  q (T, ..., 4).  Test: test_mocap.py::test_resample."""
     flip = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=-1, keepdims=True) < 0, -1.0, 1.0), axis=0)
     return np.concatenate([q[:1], q[1:] * flip])
 
@@ -128,7 +129,7 @@ def angular_velocity(q, rate):
 
 
 def linear_velocity(x, rate):
-    """Central differences, one-sided at the ends.  x (T, ...) -> (T, ...) per second.  Test: test_mocap.py::test_velocities."""
+    """Central differences of x (T, ...), one-sided at the ends, per second.  Test: test_mocap.py::test_velocities."""
     nxt, prv = np.concatenate([x[1:], x[-1:]]), np.concatenate([x[:1], x[:-1]])
     return (nxt - prv) * _span(len(x), rate).reshape((-1,) + (1,) * (x.ndim - 1))
 
@@ -163,7 +164,7 @@ class Clip:
     """A motion of the canonical human.
 
     name  : where it comes from
-    body  : whose body it is; only clips of one body are stitched together
+    body  : whose body it is (from a BVH: rig and limb lengths); only clips of one body are stitched together
     rate  : frames a second
     pos   : (T, 15, 3) joint centre at the near end of each segment [m], world; pelvis: midpoint of the hip joints
     quat  : (T, 15, 4) anatomical frame of each segment -> world
@@ -205,7 +206,7 @@ class Rig:
     """How one capture skeleton maps to the canonical human.
 
     joints : segment -> joint of the file.  pelvis is placed at the midpoint of the thighs' joints
-    axes   : segment -> (forward, left, up) in the joint's own frame when standing, each a letter such as "-z", or a vector
+    axes   : segment -> (forward, left, up) in the joint's own frame when standing, each as "-z" or a vector
     pitch  : segment -> degrees by which the joint's forward axis points down when standing; taken out
     balls  : the joints at the balls of the feet, left and right
     """
@@ -218,7 +219,7 @@ class Rig:
     signature: tuple = ()
 
     def calibration(self, segment: str) -> np.ndarray:
-        """Constant rotation anatomical frame -> joint frame, as a quaternion.  Test: test_mocap.py::test_rigs_stand_upright."""
+        """Constant rotation anatomical frame -> joint frame (4,).  Test: test_mocap.py::test_rigs_stand_upright."""
         cols = np.stack([_axis(a) for a in self.axes[segment]], axis=1)  # (3, 3): forward, left, up as columns
         q = Rotation.from_matrix(cols).as_quat(scalar_first=True)
         return quat_mul(q, quat_about(1, np.radians(-self.pitch.get(segment, 0.0))))
@@ -250,9 +251,9 @@ def _limbs(frames: dict) -> dict:
     return out
 
 
-# Axes were read off standing and walking frames: the bones lie along local x in both rigs, knees and elbows turn about one local
-# axis.  Pitches: the foot's bone slopes down to the ball by this much when the foot is flat; the Bandai head looks down by this
-# much in the mean over `walk_normal`, where people look ahead (ASSUMED).
+# Axes were read off standing and walking frames: the bones lie along local x in both rigs, knees and elbows turn about
+# one local axis.  Pitches: the foot's bone slopes down to the ball by this much when the foot is flat; the Bandai head
+# looks down by this much in the mean over `walk_normal`, where people look ahead (ASSUMED).
 RIGS = {
     "bandai": Rig(
         signature=("joint_Root", "Hips", "UpperLeg_L", "LowerArm_R"),
@@ -308,7 +309,7 @@ _Y_UP = np.array([0.5, 0.5, 0.5, 0.5])
 def rig_of(b: bvh.Bvh) -> str:
     """Name of the rig whose joints the file has.
 
-    Raises    UserError: none; names the joints found and the rigs known.
+    Raises    UserError: no rig; names the joints found and the rigs known
     Test      tests/test_mocap.py::test_unknown_rig
     """
     for name, rig in RIGS.items():
@@ -325,23 +326,44 @@ def from_bvh(path) -> Clip:
 
     Symbols   p = u·P(p_file), q = q_yup q_file C: unit u, axes P and q_yup, calibration C of the rig
     Frame     world, floor at z = 0, metres
-    Raises    UserError: not a BVH, or an unknown skeleton
-    Test      tests/test_mocap.py::test_bvh_against_scipy
+    Raises    UserError: cannot be opened, not a BVH, or an unknown skeleton
+    Test      tests/test_mocap.py::test_bvh_against_scipy, ::test_root_offset
     """
+    return _canonical(_read(path))
+
+
+def _read(path) -> bvh.Bvh:
     try:
-        b = bvh.read(path)
+        return bvh.read(path)
     except bvh.BvhError as e:
         raise UserError(str(e)) from None
+    except OSError as e:
+        raise UserError(f"{path}: {e.strerror or e}; expected a .bvh file") from None
+
+
+def _canonical(b: bvh.Bvh) -> Clip:
     name = rig_of(b)
     rig = RIGS[name]
     pose = _clip_of(b, rig, name, "replace")
     root = b.parents.argmin()
     if np.any(b.offsets[root]) and any("position" in c for c in b.channels[root]):
-        # Some exporters add the root's OFFSET to its channels, most do not: the one that puts the feet on the floor is right.
+        # Some exporters add the root's OFFSET to its channels, most do not: right is what puts the feet on the floor.
         added = _clip_of(b, rig, name, "add")
         if abs(_lowest(added)) < abs(_lowest(pose)):
             pose = added
-    return pose
+    return replace(pose, body=_body(name, pose))
+
+
+def _body(rig: str, clip: Clip) -> str:
+    """Whose body: the rig and the lengths of leg and arm [cm], so that two people in one rig are two bodies."""
+    leg = clip.limb("thigh_l", "shin_l") + clip.limb("shin_l", "foot_l")
+    arm = clip.limb("upper_arm_l", "forearm_l") + clip.limb("forearm_l", "hand_l")
+    return f"{rig}-leg{100 * leg:.0f}-arm{100 * arm:.0f}"
+
+
+@cache
+def _calibrations(rig: str) -> np.ndarray:
+    return np.stack([RIGS[rig].calibration(s) for s in SEGMENTS])
 
 
 def _lowest(clip):
@@ -353,7 +375,7 @@ def _clip_of(b, rig, name, root_offset):
     index = {n: i for i, n in enumerate(b.names)}
     cols = [index[rig.joints[s]] for s in SEGMENTS]
     p = pos[..., [2, 0, 1]] * rig.unit
-    q = quat_mul(_Y_UP, quat_mul(quat[:, cols], np.stack([rig.calibration(s) for s in SEGMENTS])))
+    q = quat_mul(_Y_UP, quat_mul(quat[:, cols], _calibrations(name)))
     joint_pos = p[:, cols].copy()
     joint_pos[:, 0] = 0.5 * (joint_pos[:, SEG["thigh_l"]] + joint_pos[:, SEG["thigh_r"]])
     ball = p[:, [index[n] for n in rig.balls]]
@@ -375,7 +397,7 @@ def resample(clip: Clip, rate: float) -> Clip:
 
 
 def place(clip: Clip, yaw: float, pivot, to) -> Clip:
-    """Turn the whole clip about the vertical through `pivot` (2,) by `yaw` and move pivot onto `to` (2,)."""
+    """Turn by `yaw` about the vertical through `pivot` (2,), put it on `to` (2,).  Test: test_mocap.py::test_place."""
     r = np.eye(3)
     r[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     pivot, to = np.append(pivot, 0.0), np.append(to, 0.0)
@@ -385,9 +407,9 @@ def place(clip: Clip, yaw: float, pivot, to) -> Clip:
 
 # ------------------------------------------------------------------------------------ what the user wears, and the feet
 
-# Where a headset and two controllers sit, in the frames of head and hands [m].  ASSUMED: the paper says "offset", no more.
-# The headset's eyes lie 11 cm before and 8 cm above the joint between skull and neck; a held controller's origin 9 cm beyond
-# the wrist and 2 cm before the palm.  Orientations are the segments' own.
+# Where a headset and two controllers sit, in the frames of head and hands [m].  ASSUMED: the paper only says "offset".
+# The headset's eyes lie 11 cm before and 8 cm above the joint between skull and neck; a held controller's origin 9 cm
+# beyond the wrist and 2 cm towards the thumb.  Orientations are the segments' own.
 SENSORS = ("head", "hand_l", "hand_r")
 SENSOR_OFFSETS = np.array([[0.11, 0.0, 0.08], [0.02, 0.0, -0.09], [0.02, 0.0, -0.09]])
 
@@ -411,7 +433,7 @@ CONTACT_HEIGHT, CONTACT_SPEED = 0.20, 0.40  # m, m/s  [Reda23 App. A]
 def contacts(clip: Clip) -> np.ndarray:
     r"""Human foot contacts  [Reda23 App. A]: height < 0.20 m above the ground and speed < 0.4 m/s.
 
-    ASSUMED   the foot is its ankle OR its ball: in contact from heel strike (ball still moving) to toe-off (heel already up)
+    ASSUMED   the foot is its ankle OR its ball: from heel strike (ball still moving) to toe-off (heel already up)
     Returns   (T, 2) bool, left and right; computed on the human, before any scaling (design.md, mistake 10)
     Test      tests/test_mocap.py::test_contacts
     """
@@ -435,7 +457,10 @@ def motion_features(clip: Clip) -> np.ndarray:
     """
     yaw = heading(clip.quat[:, 0])
     c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-    turn = lambda v: np.stack([c * v[..., 0] + s * v[..., 1], -s * v[..., 0] + c * v[..., 1], v[..., 2]], -1)  # noqa: E731
+
+    def turn(v):  # world -> heading frame
+        return np.stack([c * v[..., 0] + s * v[..., 1], -s * v[..., 0] + c * v[..., 1], v[..., 2]], -1)
+
     p = clip.pos[:, _MATCHED]
     root = clip.pos[:, :1] * [1.0, 1.0, 0.0]
     f = np.concatenate([turn(p - root), VELOCITY_WEIGHT * turn(linear_velocity(p, clip.rate))], axis=1)
@@ -450,32 +475,40 @@ class StitchReport:
     seconds: float = 0.0
     joins: int = 0
     distances: list = field(default_factory=list)
-    lost: list = field(default_factory=list)  # clips that are in no sequence
-    frames: int = 0
-    frames_used: int = 0
+    lost: list = field(default_factory=list)  # names of clips that are in no sequence
+    frames: int = 0  # in all clips
+    frames_used: int = 0  # of them in at least one sequence
     limit: float = 0.0
 
     def __str__(self):
+        text = f"{self.sequences} sequences, {self.seconds / 60:.1f} min, "
         if not self.joins and not self.lost:
-            return f"{self.sequences} sequences, {self.seconds / 60:.1f} min, no joins needed"
-        d = np.array(self.distances or [0.0])
-        text = (
-            f"{self.sequences} sequences, {self.seconds / 60:.1f} min, {self.joins} joins at {100 * d.mean():.1f} cm mean "
-            f"({100 * d.max():.1f} max, limit {100 * self.limit:.0f}); {100 * self.frames_used / max(self.frames, 1):.0f} % of frames used"
-        )
-        return text + (f"; lost {len(self.lost)} clips ({', '.join(self.lost[:3])}{', …' if len(self.lost) > 3 else ''})" if self.lost else "")
+            return text + "no joins needed"
+        if self.joins:
+            d = 100 * np.array(self.distances)
+            text += f"{self.joins} joins at {d.mean():.1f} cm mean ({d.max():.1f} max, limit {100 * self.limit:.0f})"
+        else:
+            text += "no joins"
+        text += f"; {100 * self.frames_used / max(self.frames, 1):.0f} % of frames used"
+        if self.lost:
+            text += f"; lost {len(self.lost)} clips ({', '.join(self.lost[:3])}{', …' if len(self.lost) > 3 else ''})"
+        return text
 
 
 def stitch(clips, rng: np.random.Generator, seconds=30.0, limit=0.15, blend=10, stay=1.0):
     r"""Join short clips into sequences of at least `seconds`.
 
     Method    at a clip's end the frame of another clip of the same body is chosen whose pose and velocity lie nearest
-              (`motion_features`), frames not yet in a sequence first; it is aligned with the root on the plane and `blend` frames are
-              cross-faded with a smooth step.  If no frame lies within `limit`, earlier exits are tried.
+              (`motion_features`; one of the best three by distance × (1 + times used), so that unused frames
+              are favoured); it is aligned with the root on the plane and `blend` frames are cross-faded with a
+              smooth step.  If no frame lies within `limit`, earlier exits are tried.
     Args      clips : list of Clip of one rate; limit [m] on the feature distance; stay [s] at least in each clip
-    Returns   list of Clip, StitchReport
-    Test      tests/test_mocap.py::test_stitch
+    Returns   list of Clip (clips that are long enough pass as they are), StitchReport
+    Raises    ValueError: clips of several rates
+    Test      tests/test_mocap.py::test_stitch, ::test_stitch_joins, ::test_stitch_bodies
     """
+    if len(rates := sorted({c.rate for c in clips})) > 1:
+        raise ValueError(f"clips at {', '.join(f'{r:g}' for r in rates)} Hz: resample them to one rate first")
     report = StitchReport(limit=limit, frames=sum(map(len, clips)))
     out = [c for c in clips if c.seconds >= seconds]
     report.frames_used = sum(map(len, out))
@@ -493,9 +526,9 @@ def _stitch_body(group, rng, seconds, limit, blend, stay, report):
     keep = blend + int(stay * rate)  # frames an entered clip must still have
     feats = [motion_features(c) for c in group]
     entries = [np.arange(max(0, len(c) - keep)) for c in group]
-    bank = np.concatenate([f[e] for f, e in zip(feats, entries, strict=True)]) if group else np.zeros((0, 1))
+    bank = np.concatenate([f[e] for f, e in zip(feats, entries, strict=True)])
     owner = np.repeat(np.arange(len(group)), [len(e) for e in entries])
-    frame = np.concatenate(entries) if group else np.zeros(0, int)
+    frame = np.concatenate(entries)
     norm = np.einsum("ij,ij->i", bank, bank)
     played = [np.zeros(len(c)) for c in group]  # how often each frame is in a sequence
 
@@ -548,7 +581,7 @@ def _stitch_body(group, rng, seconds, limit, blend, stay, report):
 
 
 def _join(parts, blend, name):
-    """Cross-fade (clip, first, last) parts: each next part is aligned at its entry with the frame where the last one is left."""
+    """Cross-fade (clip, first, last) parts: each is aligned at its entry with the frame where the last is left."""
     clip, a, b = parts[0]
     pos, quat, ball = ([x[a:b]] for x in (clip.pos, clip.quat, clip.ball))
     current = clip
@@ -560,11 +593,14 @@ def _join(parts, blend, name):
         for store, old, new in ((pos, current.pos, nxt.pos), (ball, current.ball, nxt.ball)):
             store.append(old[b : b + blend] + w[:, None, None] * (new[na : na + blend] - old[b : b + blend]))
             store.append(new[na + blend : nb])
-        quat.append(quat_slerp(current.quat[b : b + blend], nxt.quat[na : na + blend], np.tile(w[:, None], (1, len(SEGMENTS)))))
+        w = np.tile(w[:, None], (1, len(SEGMENTS)))
+        quat.append(quat_slerp(current.quat[b : b + blend], nxt.quat[na : na + blend], w))
         quat.append(nxt.quat[na + blend : nb])
         current, b = nxt, nb
-    pos.append(current.pos[b : b + 1]), quat.append(current.quat[b : b + 1]), ball.append(current.ball[b : b + 1])
-    return Clip(name, clip.body, clip.rate, np.concatenate(pos), quat_continuous(np.concatenate(quat)), np.concatenate(ball))
+    for store, values in ((pos, current.pos), (quat, current.quat), (ball, current.ball)):
+        store.append(values[b : b + 1])
+    pos, quat, ball = map(np.concatenate, (pos, quat, ball))
+    return Clip(name, clip.body, clip.rate, pos, quat_continuous(quat), ball)
 
 
 # ------------------------------------------------------------------------------------ data sets
@@ -576,7 +612,7 @@ def split_of(name: str) -> str:
     """Which part of a data set a clip belongs to: by its name only, so that no run can see a held-out clip by accident.
 
     style       : the whole style `youthful` (unseen style)
-    validation  : every clip whose trailing number ends in 5 (unseen clips)
+    validation  : every clip whose trailing number ends in 5 (unseen clips; in LaFAN1 that is subject 5)
     train       : the rest
     Test        tests/test_mocap.py::test_split
     """
@@ -587,7 +623,7 @@ def split_of(name: str) -> str:
 
 
 def builtin_clips(rate=CONTROL_RATE, seed=0) -> list[Clip]:
-    """The procedural human of gait.py as clips: the data set that needs no download.  Test: tests/test_mocap.py::test_builtin."""
+    """The procedural human of gait.py: the data set that needs no download.  Test: test_mocap.py::test_builtin."""
     return [
         Clip(f"{m['name']}_{i:03d}", f"builtin_{i:03d}", m["rate"], m["pos"], m["quat"], m["ball"])
         for i, m in enumerate(gait.library(rate=rate, seed=seed))
@@ -598,82 +634,100 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all") -> list[Cl
     """Single clips of a data set, at one rate.
 
     Args      motion : "builtin", a BVH file, or a folder of them (searched below); clips : shell pattern on the names
-              split : train | validation | style | all.  A set too small to hold anything out (no name in the split) is used whole
-    Raises    UserError: nothing there, or nothing matches; names what would have been valid
-    Test      tests/test_mocap.py::test_split
+              split : train | validation | style | all.  A folder of fewer than ten files none of whose names is in the
+              split is used whole, and says so
+    Raises    UserError: nothing there, a malformed file, or nothing matches; names what would have been valid
+    Test      tests/test_mocap.py::test_split, ::test_load_errors, ::test_bandai_loads_in_seconds
     """
     if split not in SPLITS:
         raise UserError(f"split {split!r} is unknown; valid: {', '.join(SPLITS)}")
-    wanted = lambda name: fnmatch(name, clips) and (split == "all" or split_of(name) == split)  # noqa: E731
     if motion == "builtin":
-        every = builtin_clips(rate)
-        names = [c.name for c in every]
-        found = [c for c in every if wanted(c.name)]
+        items = {c.name: c for c in builtin_clips(rate)}.items()
     else:
         path = Path(motion)
         if not path.exists():
             raise UserError(f"{motion}: no such file or folder; valid: builtin, a .bvh file, or a folder of them")
-        files = sorted(path.rglob("*.bvh")) if path.is_dir() else [path]
-        names = [f.stem for f in files]
+        files = sorted(f for f in path.rglob("*") if f.suffix.lower() == ".bvh") if path.is_dir() else [path]
         if not files:
             raise UserError(f"{motion}: holds no .bvh file")
-        chosen = [f for f in files if wanted(f.stem)]
-        if not chosen and len(files) < 10 and split in ("train", "validation"):
-            print(f"{motion}: only {len(files)} clips, none to hold out: {split} uses all of them", file=sys.stderr)
-            chosen = [f for f in files if fnmatch(f.stem, clips)]
-        found = [resample(from_bvh(f), rate) for f in chosen]
-    if not found:
-        raise UserError(f"{motion}: no clip matches {clips!r} in split {split!r}; there are {', '.join(names[:6])}, … ({len(names)})")
-    return found
+        items = [(f.stem, f) for f in files]
+    matching = [(name, item) for name, item in items if fnmatchcase(name, clips)]
+    chosen = [item for name, item in matching if split in ("all", split_of(name))]
+    if not matching:
+        names = [name for name, _ in items]
+        more = f", … ({len(names)})" if len(names) > 6 else ""
+        raise UserError(f"{motion}: no clip matches {clips!r}; there are {', '.join(names[:6])}{more}")
+    if not chosen and motion != "builtin" and len(files) < 10 and split != "style":
+        print(f"{motion}: only {len(files)} clips, none to hold out: {split} uses all of them", file=sys.stderr)
+        chosen = [item for _, item in matching]
+    if not chosen:
+        found = sorted({split_of(name) for name, _ in matching})
+        raise UserError(
+            f"{motion}: none of the {len(matching)} clips that match {clips!r} is in split {split!r}; "
+            f"they are in {' and '.join(found)}"
+        )
+    return chosen if motion == "builtin" else [resample(from_bvh(f), rate) for f in chosen]
 
 
-def sequences(motion="builtin", split="train", clips="*", rate=CONTROL_RATE, seed=0, limit=0.15, verbose=True) -> list[Clip]:
-    """Stitched sequences of a data set: what training and measuring use.  Test: tests/test_mocap.py::test_stitch."""
-    single = load(motion, rate, clips, split)
+def sequences(
+    motion="builtin", split="train", clips="*", rate=CONTROL_RATE, seed=0, limit=0.15, verbose=True
+) -> list[Clip]:
+    """Stitched sequences of a data set: what training and measuring use.  Test: tests/test_mocap.py::test_sequences.
+
+    A set of which nothing can be joined into a sequence comes back as its single clips, and says so.
+    """
+    return _sequences(load(motion, rate, clips, split), f"{motion} [{split}]", seed, limit, verbose)
+
+
+def _sequences(single, title, seed=0, limit=0.15, verbose=True):
     out, report = stitch(single, np.random.default_rng(seed), limit=limit)
-    if not out:  # nothing could be joined: single clips are all there is
-        out, report.lost = single, []
-        report.sequences, report.seconds = len(out), sum(c.seconds for c in out)
     if verbose:
-        print(f"{motion} [{split}] {len(single)} clips, {sum(c.seconds for c in single) / 60:.1f} min -> {report}")
-    return out
+        result = str(report) if out else "too few to join: single clips are used"
+        print(f"{title} {len(single)} clips, {sum(c.seconds for c in single) / 60:.1f} min -> {result}")
+    return out or list(single)
 
 
 # ------------------------------------------------------------------------------------ python mocap.py inspect
 
 
 def describe(clip: Clip) -> str:
-    """Rate, length, speed and contacts of a clip in one line.  Test: tests/test_cli.py::test_inspect."""
+    """Rate, length, speed and contacts of a clip in one line.  Test: tests/test_mocap.py::test_inspect."""
     travel = np.linalg.norm(np.diff(clip.pos[:, 0, :2], axis=0), axis=-1).sum()
+    speed = travel * clip.rate / max(len(clip) - 1, 1)
     c = contacts(clip)
     falls = int(np.sum(np.diff(c.astype(int), axis=0) > 0))
     return (
-        f"{clip.name:36s} {clip.rate:5.1f} Hz {len(clip):5d} frames {clip.seconds:6.1f} s  {travel:6.2f} m  {travel / max(clip.seconds, 1e-9):4.2f} m/s  "
-        f"contact L {100 * c[:, 0].mean():3.0f} % R {100 * c[:, 1].mean():3.0f} %  {falls:3d} footfalls  hips {clip.hip_height:.2f} m"
+        f"{clip.name:36s} {clip.rate:5.1f} Hz {len(clip):5d} frames {clip.seconds:6.1f} s  "
+        f"{travel:6.2f} m  {speed:4.2f} m/s  contact L {100 * c[:, 0].mean():3.0f} % R {100 * c[:, 1].mean():3.0f} %  "
+        f"{falls:3d} footfalls  hips {clip.hip_height:.2f} m"
     )
 
 
 def inspect(path) -> None:
-    """Print what a file or a folder holds."""
+    """Print what a file or a folder holds.  Test: tests/test_mocap.py::test_inspect."""
     path = Path(path)
     if path.is_dir():
-        for clip in load(path, rate=CONTROL_RATE):
+        clips = load(path)
+        for clip in clips:
             print(describe(clip))
-        sequences(path, split="all")
+        _sequences(clips, f"{path} [all]")
         return
-    clip = from_bvh(path)
-    b = bvh.read(path)
-    print(f"{path}: rig {rig_of(b)}, {len(b.names)} joints")
-    depth = {}
-    for i, n in enumerate(b.names):
-        depth[i] = depth[b.parents[i]] + 1 if b.parents[i] >= 0 else 0
-        segment = next((s for s, j in RIGS[clip.body].joints.items() if j == n), "")
-        print(f"  {'  ' * depth[i]}{n:18s} {segment}")
-    print(describe(clip))
+    b = _read(path)
+    rig = rig_of(b)
+    segment = {joint: s for s, joint in RIGS[rig].joints.items()}
+    print(f"{path}: rig {rig}, {len(b.names)} joints")
+    depth = []
+    for name, parent in zip(b.names, b.parents):
+        depth.append(depth[parent] + 1 if parent >= 0 else 0)
+        print(f"  {'  ' * depth[-1]}{name:18s} {segment.get(name, '')}".rstrip())
+    print(describe(_canonical(b)))
 
 
 def main(argv=None) -> None:
-    parser = argparse.ArgumentParser(prog="mocap.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """python mocap.py inspect FILE|FOLDER."""
+    parser = argparse.ArgumentParser(
+        prog="mocap.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     sub = parser.add_subparsers(dest="command", required=True)
     p = sub.add_parser("inspect", help="print skeleton, rate, length, speed and contacts")
     p.add_argument("path", help="a .bvh file, or a folder of them")

@@ -59,7 +59,9 @@ from runs import (
 
 @dataclass
 class Options:
-    """Everything a run is made of.  Table 3 of the paper (its hyper-parameters) is lost: these are ASSUMED, from measured runs."""
+    """Everything a run is made of.
+
+    Table 3 of the paper (its hyper-parameters) is lost: these are ASSUMED, from measured runs."""
 
     character: str = arg("jesse", "name in characters/, or path of a .toml")
     motion: str = arg("builtin", "builtin, a .bvh file, or a folder of them")
@@ -96,8 +98,8 @@ def gae(reward, value, next_value, done, gamma, lam):
     r"""Generalised advantage estimation; with λ = 1 the return of Appendix B minus the old value.
 
     Equation  δ_t = r_t + γ V(o_{t+1}) − V(o_t);  A_t = δ_t + γ λ (1 − done_t) A_{t+1}
-    Symbols   V(o_{t+1}) -> next_value: of the state the step led to, BEFORE any reset: 0 after a failure, the old network's
-              value after a truncation and at the end of the collected trajectory (bootstrap)
+    Symbols   V(o_{t+1}) -> next_value: of the state the step led to, BEFORE any reset: 0 after a failure, the old
+              network's value after a truncation and at the end of the collected trajectory (bootstrap)
     Args      reward, value, next_value : (T, N); done : (T, N) bool, terminated or truncated
     Returns   advantage (T, N), return = advantage + value (T, N)
     Raises    ValueError: shapes differ
@@ -105,7 +107,10 @@ def gae(reward, value, next_value, done, gamma, lam):
     Test      tests/test_ppo.py::test_gae_against_slow_loop, test_lambda_one_is_appendix_b
     """
     if not reward.shape == value.shape == next_value.shape == done.shape:
-        raise ValueError(f"shapes differ: reward {reward.shape}, value {value.shape}, next_value {next_value.shape}, done {done.shape}")
+        raise ValueError(
+            f"shapes differ: reward {reward.shape}, value {value.shape}, "
+            f"next_value {next_value.shape}, done {done.shape}"
+        )
     delta = reward + gamma * next_value - value
     advantage = np.zeros_like(delta)
     carry = np.zeros_like(delta[0])
@@ -139,7 +144,10 @@ def clipped_surrogate(logp, logp_old, adv, eps):
 
 
 def standardise(x):
-    """Â = (A − mean) / (std + 1e-8).  ASSUMED: Appendix B's Â is not defined.  Test: tests/test_ppo.py::test_standardise"""
+    """Â = (A − mean) / (std + 1e-8).  ASSUMED: Appendix B's Â is not defined.
+
+    Test      tests/test_ppo.py::test_standardise
+    """
     return (x - x.mean()) / (x.std() + 1e-8)
 
 
@@ -189,8 +197,11 @@ class Policy:
     value_scale : V = value_scale × critic(o), so that the network's output is of order 1
     """
 
-    def __init__(self, obs_size, critic_size, action_size, hidden, value_hidden, sigma, value_scale, rng, dtype=np.float32):
-        self.obs_size, self.critic_size, self.action_size, self.value_scale = obs_size, critic_size, action_size, value_scale
+    def __init__(
+        self, obs_size, critic_size, action_size, hidden, value_hidden, sigma, value_scale, rng, dtype=np.float32
+    ):
+        self.obs_size, self.critic_size, self.action_size = obs_size, critic_size, action_size
+        self.value_scale = value_scale
         self.hidden, self.value_hidden = tuple(hidden), tuple(value_hidden)
         self.actor = MLP((obs_size, *hidden, action_size), rng=rng, gain=0.01, dtype=dtype)
         self.critic = MLP((critic_size, *value_hidden, 1), rng=rng, gain=1.0, dtype=dtype)
@@ -227,7 +238,11 @@ class Policy:
         }
 
     def load(self, arrays):
-        self.theta_pi[:], self.critic.theta[:] = arrays["policy.pi"], arrays["policy.critic"]
+        """Take over what `arrays` returned.  ValueError: other sizes"""
+        for name, own in (("policy.pi", self.theta_pi), ("policy.critic", self.critic.theta)):
+            if arrays[name].shape != own.shape:
+                raise ValueError(f"{name} has shape {arrays[name].shape}, expected {own.shape}")
+            own[:] = arrays[name]
         self.norm.load_state({k: arrays[f"policy.norm.{k}"] for k in ("count", "mean", "m2")})
 
 
@@ -259,8 +274,8 @@ def check_fits(policy: Policy, env: Env, path):
     have, need = (policy.obs_size, policy.action_size), (env.obs_size, env.action_size)
     if have != need:
         raise UserError(
-            f"{path}: a policy of {have[0]} observations and {have[1]} actions; {env.char.name} needs {need[0]} and {need[1]}: "
-            "use the character it was trained for"
+            f"{path}: a policy of {have[0]} observations and {have[1]} actions; "
+            f"{env.char.name} needs {need[0]} and {need[1]}: use the character it was trained for"
         )
 
 
@@ -279,7 +294,9 @@ class Trainer:
         weights = sum(env.char.reward[t][0] for t in TERMS)
         scale = weights / max(1.0 - opt.gamma, 1e-3)  # the largest return
         sizes = (env.obs_size, env.critic_size, env.action_size)
-        self.policy = Policy(*sizes, opt.hidden, opt.value_hidden, opt.sigma, scale, np.random.default_rng([opt.seed, 2]))
+        self.policy = Policy(
+            *sizes, opt.hidden, opt.value_hidden, opt.sigma, scale, np.random.default_rng([opt.seed, 2])
+        )
         self.adam_pi = Adam(self.policy.theta_pi.size, opt.lr)
         self.adam_v = Adam(self.policy.critic.theta.size, opt.value_lr)
         self.steps = self.updates = 0
@@ -345,7 +362,7 @@ class Trainer:
         t, n = self.reward.shape
         self.old_value = policy.value(self.x.reshape(t * n, -1)).reshape(t, n)
         self.next_value[:-1] = self.old_value[1:]
-        self.next_value[-1] = policy.value(policy.norm.normalise(env.full))  # Appendix B: bootstrap at the trajectory's end
+        self.next_value[-1] = policy.value(policy.norm.normalise(env.full))  # App. B: bootstrap at the trajectory's end
         for step, ids, rows in finals:  # truncation is not failure (design.md, mistake 1)
             self.next_value[step, ids] = policy.value(rows)
         self.next_value[self.terminated] = 0.0
@@ -369,7 +386,9 @@ class Trainer:
             for start in range(0, samples, opt.minibatch):
                 rows = order[start : start + opt.minibatch]
                 xb = x[rows]
-                loss, grad, out = policy_loss(policy, xb[:, : policy.obs_size], action[rows], logp[rows], adv[rows], opt.clip_eps)
+                loss, grad, out = policy_loss(
+                    policy, xb[:, : policy.obs_size], action[rows], logp[rows], adv[rows], opt.clip_eps
+                )
                 clip_grad_norm(grad, opt.max_grad_norm)
                 kls.append(gaussian_kl(mu[rows], old_std, out["mu"], policy.log_std))
                 self.adam_pi.step(policy.theta_pi, grad)
@@ -409,21 +428,34 @@ class Trainer:
         arrays = self.policy.arrays() | {f"env.{k}": v for k, v in env_arrays.items()}
         for name, adam in (("adam_pi", self.adam_pi), ("adam_v", self.adam_v)):
             arrays |= {f"{name}.{k}": v for k, v in adam.state().items()}
-        own = dict(steps=self.steps, updates=self.updates, lr=self.adam_pi.lr, rng=rng_state(self.rng), env=env_meta, policy=self.policy.shape())
+        own = dict(
+            steps=self.steps,
+            updates=self.updates,
+            lr=self.adam_pi.lr,
+            rng=rng_state(self.rng),
+            env=env_meta,
+            policy=self.policy.shape(),
+        )
         save_checkpoint(path, arrays, meta | own)
 
     def restore(self, arrays, meta):
-        """Continue bit-exactly from what `save` wrote."""
-        self.policy.load(arrays)
-        for name, adam in (("adam_pi", self.adam_pi), ("adam_v", self.adam_v)):
-            adam.load_state({k: arrays[f"{name}.{k}"] for k in ("t", "m", "v")})
-        self.adam_pi.lr, self.steps, self.updates = meta["lr"], meta["steps"], meta["updates"]
-        self.rng = rng_from_state(meta["rng"])
-        self.env.load_state({k[4:]: v for k, v in arrays.items() if k.startswith("env.")}, meta["env"])
+        """Continue bit-exactly from what `save` wrote.  UserError: something else was saved"""
+        try:
+            self.policy.load(arrays)
+            for name, adam in (("adam_pi", self.adam_pi), ("adam_v", self.adam_v)):
+                adam.load_state({k: arrays[f"{name}.{k}"] for k in ("t", "m", "v")})
+            self.adam_pi.lr, self.steps, self.updates = meta["lr"], meta["steps"], meta["updates"]
+            self.rng = rng_from_state(meta["rng"])
+            self.env.load_state({k[4:]: v for k, v in arrays.items() if k.startswith("env.")}, meta["env"])
+        except (KeyError, TypeError, ValueError) as e:
+            raise UserError(f"the checkpoint does not fit this run ({e}); start a new one with --init") from None
 
 
 def fingerprint(ref) -> str:
-    """Hash of the reference motions: tells whether two runs saw the same data.  Test: tests/test_ppo.py::test_fingerprint"""
+    """Hash of the reference motions: tells whether two runs saw the same data.
+
+    Test      tests/test_ppo.py::test_fingerprint
+    """
     return hashlib.sha256(np.ascontiguousarray(ref.qpos)).hexdigest()[:16]
 
 
@@ -451,7 +483,10 @@ def resumed_options(opt: Options, argv) -> Options:
         value = tuple(value) if isinstance(value, list) else value
         if f.name in given and getattr(opt, f.name) != value:
             if f.name not in CHANGEABLE:
-                raise UserError(f"{opt.out}: was started with --{f.name} {value}; to resume, leave it out (can change: {', '.join(CHANGEABLE[:3])})")
+                raise UserError(
+                    f"{opt.out}: was started with --{f.name} {value}; to resume, leave it out "
+                    f"(can change: {', '.join(CHANGEABLE[:3])})"
+                )
             value = getattr(opt, f.name)
         values[f.name] = value
     return Options(**values | {"resume": True, "out": opt.out})
@@ -478,32 +513,40 @@ class StopFlag:
 def train(opt: Options) -> Trainer:
     """Run, or resume, a training run.  Test: tests/test_ppo.py::test_resume_is_exact, tests/test_cli.py::test_ppo"""
     out = Path(opt.out)
-    loaded = latest_checkpoint(out) if opt.resume else None
+    loaded = latest_checkpoint(out, ("policy.*",)) if opt.resume else None
     began = time.perf_counter()
     # The configuration is checked and the motions are read before the folder is made: a typo leaves nothing behind.
     env = make_env(opt)
     trainer = Trainer(opt, env)
-    if opt.init and not opt.resume:
+    if opt.init and not loaded:  # a run resumed before its first checkpoint begins as it began
         policy, _ = load_policy(opt.init)
         check_fits(policy, env, opt.init)
-        if (policy.critic_size, policy.hidden, policy.value_hidden) != (env.critic_size, trainer.policy.hidden, trainer.policy.value_hidden):
-            raise UserError(f"{opt.init}: its networks are {policy.hidden}, {policy.value_hidden}: give --hidden and --value-hidden to match")
+        sizes = lambda p: (p.critic_size, p.hidden, p.value_hidden)  # noqa: E731
+        if sizes(policy) != sizes(trainer.policy):
+            raise UserError(
+                f"{opt.init}: its networks are {policy.hidden}, {policy.value_hidden}: "
+                "give --hidden and --value-hidden to match"
+            )
         trainer.policy.load(policy.arrays())
         np.maximum(trainer.policy.log_std, np.log(opt.min_sigma), out=trainer.policy.log_std)
     data = {"fingerprint": fingerprint(env.ref), "sequences": len(env.ref.names), "minutes": len(env.ref) * env.dt / 60}
     if loaded and loaded[1].get("data", data)["fingerprint"] != data["fingerprint"]:
-        raise UserError(f"{out}: the motions have changed since the run began ({loaded[1]['data']} against {data}); start a new run with --init {out}")
-    open_run(out, asdict(opt) | {"data": data}, opt.resume)
+        raise UserError(
+            f"{out}: the motions have changed since the run began ({loaded[1]['data']} against {data}); "
+            f"start a new run with --init {out}"
+        )
     if loaded:
         trainer.restore(*loaded)
     else:
         trainer.start()
+    open_run(out, asdict(opt) | {"data": data}, opt.resume)
     metrics = Metrics(out / METRICS, loaded[1]["rows"] if loaded else None)
     meta = {"options": asdict(opt), "data": data}
     progress = Progress(opt.steps, trainer.steps)
     print(
-        f"{env.char.name}: {env.obs_size} observations ({env.critic_size} for the critic), {env.action_size} torques, {len(env.ref.names)} sequences, "
-        f"{data['minutes']:.1f} min; policy {trainer.policy.actor.n_params:,} and critic {trainer.policy.critic.n_params:,} weights; ready in {time.perf_counter() - began:.1f} s"
+        f"{env.char.name}: {env.obs_size} observations ({env.critic_size} for the critic), {env.action_size} torques, "
+        f"{len(env.ref.names)} sequences, {data['minutes']:.1f} min; policy {trainer.policy.actor.n_params:,} and "
+        f"critic {trainer.policy.critic.n_params:,} weights; ready in {time.perf_counter() - began:.1f} s"
     )
     saved = time.perf_counter()
     with StopFlag() as flag:
@@ -534,7 +577,7 @@ def progress_line(s) -> dict:
         "steps/s": f"{s['steps_per_s']:.0f}",
         "fails every": f"{s['time_to_failure']:.2f} s",
         "survival": f"{s['survival']:.2f}",
-        "return": f"{s['reward']:.2f}",
+        "reward": f"{s['reward']:.2f}",
         "[": f"{terms} ]",
         "ends": ends or "none",
         "kl": f"{s['kl']:.3f}",

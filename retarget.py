@@ -46,14 +46,15 @@ STAGE_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 class Character:
     """A MuJoCo model with the tables of its TOML resolved to indices and arrays.
 
-    nq = 7 + j, nv = 6 + j for j hinges; u driven hinges (those with a motor).  Hinge arrays have length j, in model order.
+    nq = 7 + j, nv = 6 + j for j hinges; u of them are driven (have a motor).  Hinge arrays are in model order.
     """
 
     name: str
+    path: Path  # of the TOML
     model: mujoco.MjModel  # collision shapes only, gains of the TOML: what is simulated
     spec: dict  # the TOML
     hinges: list[str]
-    ranges: np.ndarray  # (j, 2) rad
+    ranges: np.ndarray  # (j, 2) rad; infinite where the hinge has no range
     default: np.ndarray  # (j,) rad, default pose
     limits: np.ndarray  # (u,) N m, base × Table 4
     driven: np.ndarray  # (u,) hinge index of each motor
@@ -85,19 +86,21 @@ class Character:
 
 
 def available() -> list[str]:
+    """Names of the characters that can be loaded.  Test: tests/test_retarget.py::test_character_checks"""
     return sorted(p.stem for p in CHARACTERS.glob("*.toml"))
 
 
-def character(name: str, visual=False) -> Character:
+def character(name: str | Path, visual=False) -> Character:
     """Load characters/NAME.toml and its model, or a path to a TOML file; check both against each other.
 
     Args      visual : keep the shapes that are only looked at (they cost time in every step)
     Raises    UserError: names the file, what is missing or does not match, and what would have been valid
-    Test      tests/test_retarget.py::test_character_checks
+    Test      tests/test_retarget.py::test_character_tables, test_character_checks
     """
     path = Path(name) if str(name).endswith(".toml") else CHARACTERS / f"{name}.toml"
     if not path.is_file():
-        raise UserError(f"no character {name!r}; there are: {', '.join(available())}; or give the path of a .toml file")
+        known = ", ".join(available())
+        raise UserError(f"no character {str(name)!r}; there are: {known}; or give the path of a .toml file")
     try:
         spec = tomllib.loads(path.read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
@@ -109,91 +112,47 @@ class _Loader:
     """Resolves the TOML's names in the model; every complaint names the file, the table and what would be valid."""
 
     TABLES = ("root", "map", "torque", "passive", "observation", "reward", "feet", "sensors", "fall")
+    SHAPES = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
 
     def __init__(self, path, spec, visual):
         self.path, self.spec = path, spec
         for table in self.TABLES:
             if not isinstance(spec.get(table), dict):
                 self.fail(f"has no table [{table}]; needed: {', '.join(self.TABLES)}")
-        xml = path.parent / str(spec.get("model", path.stem + ".xml"))
+        self.xml = path.parent / str(spec.get("model", path.stem + ".xml"))
+        if not self.xml.is_file():
+            found = ", ".join(sorted(p.name for p in path.parent.glob("*.xml"))) or "none"
+            self.fail(f"model = {self.xml.name!r} is not a file beside it; .xml files there: {found}")
         try:
-            mjspec = mujoco.MjSpec.from_file(str(xml))
+            mjspec = mujoco.MjSpec.from_file(str(self.xml))
             for geom in list(mjspec.geoms) if not visual else []:
                 if geom.contype == 0 and geom.conaffinity == 0:
                     mjspec.delete(geom)
             self.model = mjspec.compile()
-        except (ValueError, FileNotFoundError) as e:
-            raise UserError(f"{xml}: {' '.join(str(e).split())}") from None
-        self.xml = xml
-
-    def fail(self, text):
-        raise UserError(f"{self.path}: {text}")
-
-    def get(self, table, key, kind, default=None):
-        value = self.spec[table].get(key, default)
-        if value is None:
-            self.fail(f"[{table}] has no {key}")
-        kinds = (int, float) if kind is float else kind
-        if not isinstance(value, kinds) or isinstance(value, bool):
-            self.fail(f"[{table}] {key} = {value!r} is not a {kind.__name__}")
-        return value
-
-    def ids(self, table, names, obj, what):
-        count = {"body": self.model.nbody, "site": self.model.nsite, "sensor": self.model.nsensor}[what]
-        out = []
-        for n in names:
-            i = mujoco.mj_name2id(self.model, obj, str(n))
-            if i < 0:
-                valid = [mujoco.mj_id2name(self.model, obj, k) for k in range(count)]
-                self.fail(f"[{table}] names {what} {n!r}, which {self.xml.name} lacks; it has {', '.join(filter(None, valid))}")
-            out.append(i)
-        return np.array(out, dtype=int)
-
-    def bodies(self, table, names):
-        return self.ids(table, names, mujoco.mjtObj.mjOBJ_BODY, "body")
+        except ValueError as e:
+            self.fail_xml(" ".join(str(e).split()))
 
     def load(self) -> Character:
         m, spec = self.model, self.spec
-        if m.njnt < 2 or m.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE or np.any(m.jnt_type[1:] != mujoco.mjtJoint.mjJNT_HINGE):
-            raise UserError(f"{self.xml}: the first joint must be free and all others hinges")
-        if not np.allclose(np.abs(m.jnt_axis[1:]).max(axis=1), 1.0):
-            raise UserError(f"{self.xml}: every hinge must turn about one axis of its body's frame (x, y or z)")
-        names = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_JOINT, k) for k in range(1, m.njnt)]
-        ranges = m.jnt_range[1:].copy()
-        if np.any(np.abs(ranges) < np.radians(2)) and np.all(np.abs(ranges) < 0.1):
-            raise UserError(f"{self.xml}: joint ranges look like degrees read as radians; set <compiler angle='radian'/>")
-        default = np.zeros(len(names))
-        for joint, value in spec.get("pose", {}).items():
-            if joint not in names:
-                self.fail(f"[pose] names joint {joint!r}; valid: {', '.join(names)}")
-            default[names.index(joint)] = value
-        driven = m.actuator_trnid[:, 0] - 1
-        limits = self.torques(names, driven)
-        self.passive(names, limits, driven)
+        names, ranges = self.skeleton()
+        default = self.default_pose(names)
+        driven, limits = self.torques(names)
+        self.passive(names, driven, limits)
         chains, mapped = self.chains(names)
-        root = int(self.bodies("root", [self.get("root", "body", str)])[0])
-        feet = self.bodies("feet", self.get("feet", "bodies", list))
-        contact = self.ids("feet", self.get("feet", "contact_sensors", list), mujoco.mjtObj.mjOBJ_SENSOR, "sensor")
-        sites = self.ids("sensors", self.get("sensors", "sites", list), mujoco.mjtObj.mjOBJ_SITE, "site")
-        if len(feet) != 2 or len(contact) != 2 or len(sites) != 3:
-            self.fail("[feet] needs two bodies and two contact_sensors (left, right); [sensors] three sites (head, left, right)")
-        fall = self.bodies("fall", self.get("fall", "bodies", list))
+        root = self.root()
+        feet, soles, contact_adr = self.feet()
         links = self.get("reward", "links", dict)
-        link_ids = self.bodies("reward.links", links)
-        collides = m.geom_conaffinity != 0
-        of = lambda body: np.flatnonzero((m.geom_bodyid == body) & collides)  # noqa: E731
-        soles = [of(b) for b in feet]
-        if len(soles[0]) == 0 or len(soles[0]) != len(soles[1]):
-            self.fail(f"[feet] bodies need the same number of collision geoms each, found {len(soles[0])} and {len(soles[1])}")
+        link_weights = [self.number(f"[reward.links] {n}", w, 0) for n, w in links.items()]
+        sites = self.ids("sensors", self.get("sensors", "sites", list), mujoco.mjtObj.mjOBJ_SITE, "site")
+        if len(sites) != 3:
+            self.fail(f"[sensors] needs three sites (head, left, right), found {len(sites)}")
         data = mujoco.MjData(m)
         data.qpos[7:] = default
         mujoco.mj_kinematics(m, data)
-        lowest = geom_lowest(m, np.concatenate(soles), data.geom_xpos[None], data.geom_xmat[None]).min()
-        scale_z = spec["root"].get("scale_z", "hip")
-        if scale_z != "hip" and not isinstance(scale_z, (int, float)):
-            self.fail(f'[root] scale_z = {scale_z!r}; valid: "hip" or a number')
+        lowest = geom_lowest(m, soles.ravel(), data.geom_xpos[None], data.geom_xmat[None]).min()
         return Character(
             name=str(spec.get("name", self.path.stem)),
+            path=self.path,
             model=m,
             spec=spec,
             hinges=names,
@@ -207,50 +166,176 @@ class _Loader:
             chains=chains,
             mapped=mapped,
             obs_links=self.bodies("observation", self.get("observation", "links", list)),
-            reward_links=link_ids,
-            link_weights=normalised(list(links.values())),
+            reward_links=self.bodies("reward.links", links),
+            link_weights=normalised(link_weights),
             joint_weights=self.joint_weights(names, mapped),
             reward=self.rewards(),
             feet=feet,
-            sole_geoms=np.stack(soles),
-            contact_adr=m.sensor_adr[contact] + (m.sensor_dim[contact] - 1),  # a force vector: its z is the normal force
+            sole_geoms=soles,
+            contact_adr=contact_adr,
             sensor_sites=sites,
-            fall_geoms=np.concatenate([of(b) for b in fall]) if len(fall) else np.zeros(0, int),
+            fall_geoms=self.collision_geoms("fall", self.get("fall", "bodies", list)),
         )
 
-    def torques(self, names, driven):
-        """Limit of each motor: base by joint group times Table 4's scale; written into the motors' gear."""
-        base, scale = self.get("torque", "base", dict), self.get("torque", "scale", dict)
-        groups = sorted({joint_group(names[h]) for h in driven})
-        for g in scale:
-            if g.lower() not in groups:
-                self.fail(f"[torque.scale] names {g!r}; the model's driven joints are {', '.join(groups)}")
-        scale = {g.lower(): s for g, s in scale.items()}
-        out = np.zeros(len(driven))
+    # ---- complaints and look-ups
+
+    def fail(self, text):
+        raise UserError(f"{self.path}: {text}")
+
+    def fail_xml(self, text):
+        raise UserError(f"{self.xml}: {text}")
+
+    def number(self, where, value, least=None):
+        """`value` if it is a finite number (and at least `least`)."""
+        if not isinstance(value, (int, float)) or isinstance(value, bool) or not np.isfinite(value):
+            self.fail(f"{where} = {value!r} is not a finite number")
+        if least is not None and value < least:
+            self.fail(f"{where} = {value!r} must be at least {least}")
+        return value
+
+    def get(self, table, key, kind):
+        """spec[table][key], which must be a str, list, dict or float (any finite number)."""
+        value = self.spec[table].get(key)
+        if value is None:
+            self.fail(f"[{table}] has no {key}; it has {', '.join(self.spec[table]) or 'nothing'}")
+        if kind is float:
+            return float(self.number(f"[{table}] {key}", value))
+        if not isinstance(value, kind):
+            self.fail(f"[{table}] {key} = {value!r} is not a {kind.__name__}")
+        return value
+
+    def ids(self, table, names, obj, what):
+        count = {"body": self.model.nbody, "site": self.model.nsite, "sensor": self.model.nsensor}[what]
+        out = []
+        for n in names:
+            i = mujoco.mj_name2id(self.model, obj, str(n))
+            if i < 0:
+                valid = ", ".join(filter(None, (mujoco.mj_id2name(self.model, obj, k) for k in range(count))))
+                self.fail(f"[{table}] names {what} {n!r}, which {self.xml.name} lacks; it has {valid}")
+            out.append(i)
+        return np.array(out, dtype=int)
+
+    def bodies(self, table, names):
+        return self.ids(table, names, mujoco.mjtObj.mjOBJ_BODY, "body")
+
+    def collision_geoms(self, table, names):
+        """Ids of the bodies' geoms that the floor can touch; only shapes that `geom_lowest` knows."""
+        m = self.model
+        found = [np.flatnonzero((m.geom_bodyid == b) & (m.geom_conaffinity != 0)) for b in self.bodies(table, names)]
+        geoms = np.concatenate(found) if found else np.zeros(0, int)
+        if not len(geoms):
+            self.fail(f"[{table}] bodies = {names!r} have no geom that the floor can touch (conaffinity 1)")
+        if not np.isin(m.geom_type[geoms], [int(s) for s in self.SHAPES]).all():
+            self.fail(f"[{table}] bodies = {names!r} have collision geoms of other types than sphere, capsule and box")
+        return geoms
+
+    # ---- the parts
+
+    def skeleton(self):
+        """Names and ranges of the hinges, and what the rest of this code takes for granted about the model."""
+        m, kinds = self.model, mujoco.mjtJoint
+        if m.njnt < 2 or m.jnt_type[0] != kinds.mjJNT_FREE or np.any(m.jnt_type[1:] != kinds.mjJNT_HINGE):
+            self.fail_xml("the first joint must be free and all others hinges")
+        if not np.allclose(np.abs(m.jnt_axis[1:]).max(axis=1), 1.0):
+            self.fail_xml("every hinge must turn about one axis of its body's frame (x, y or z)")
+        floors = (m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (m.geom_bodyid == 0) & (m.geom_pos[:, 2] == 0.0)
+        if not floors.any():
+            self.fail_xml("needs a floor: a geom of type plane at height 0 in the world body")
+        names = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_JOINT, k) for k in range(1, m.njnt)]
+        limited = m.jnt_limited[1:].astype(bool)
+        widest = np.abs(m.jnt_range[1:])[limited].max(initial=0.0)
+        if limited.any() and widest < 0.1:
+            self.fail_xml("joint ranges look like degrees read as radians; set <compiler angle='radian'/>")
+        if widest > 2 * np.pi:
+            worst = names[np.abs(m.jnt_range[1:]).max(axis=1).argmax()]
+            self.fail_xml(f"the range of hinge {worst} reaches {widest:.0f} rad: it looks like degrees; write radians")
+        return names, np.where(limited[:, None], m.jnt_range[1:], [-np.inf, np.inf])
+
+    def default_pose(self, names):
+        """[pose]: angles of the default pose, where the passive springs pull to as well."""
+        default, pose = np.zeros(len(names)), self.spec.get("pose", {})
+        if not isinstance(pose, dict):
+            self.fail(f"pose = {pose!r} is not a table of joint = angle")
+        for joint, value in pose.items():
+            if joint not in names:
+                self.fail(f"[pose] names joint {joint!r}; valid: {', '.join(names)}")
+            if abs(self.number(f"[pose] {joint}", value)) > 2 * np.pi:
+                self.fail(f"[pose] {joint} = {value!r} looks like degrees; write radians")
+            default[names.index(joint)] = value
+        self.model.qpos_spring[7:] = default
+        return default
+
+    def root(self):
+        m = self.model
+        root, free = int(self.bodies("root", [self.get("root", "body", str)])[0]), int(m.jnt_bodyid[0])
+        if root != free:
+            self.fail(f"[root] body = {m.body(root).name!r} must be the body of the free joint, {m.body(free).name!r}")
+        for key in ("scale_xy", "scale_z"):
+            value = self.spec["root"].get(key, 1.0)
+            if isinstance(value, str) and not (key == "scale_z" and value == "hip"):
+                self.fail(f"[root] {key} = {value!r}; valid: a number" + (' or "hip"' if key == "scale_z" else ""))
+            if value != "hip" and self.number(f"[root] {key}", value) <= 0:
+                self.fail(f"[root] {key} = {value!r} must be greater than 0")
+        return root
+
+    def feet(self):
+        """Body ids (2,), sole geoms (2, g), addresses of the normal forces (2,)."""
+        m, names = self.model, self.get("feet", "bodies", list)
+        feet = self.bodies("feet", names)
+        contact = self.ids("feet", self.get("feet", "contact_sensors", list), mujoco.mjtObj.mjOBJ_SENSOR, "sensor")
+        if len(feet) != 2 or len(contact) != 2:
+            found = f"{len(feet)} and {len(contact)}"
+            self.fail(f"[feet] needs two bodies and two contact_sensors (left, right), found {found}")
+        soles = [self.collision_geoms("feet", [n]) for n in names]
+        if len(soles[0]) != len(soles[1]):
+            self.fail(f"[feet] bodies need as many collision geoms each, found {len(soles[0])} and {len(soles[1])}")
+        # A sensor of one number is the normal force; of a vector, world axes, its last number (z) is.
+        return feet, np.stack(soles), m.sensor_adr[contact] + (m.sensor_dim[contact] - 1)
+
+    def by_group(self, table, key, groups):
+        """A table of numbers by joint group ("spine1", or "spine" for all of spine0, spine1, …), names checked."""
+        values = {g.lower(): self.number(f"[{table}.{key}] {g}", v, 0) for g, v in self.get(table, key, dict).items()}
+        valid = groups | {g.rstrip("0123456789") for g in groups} | {"default"}
+        for g in values:
+            if g not in valid:
+                self.fail(f"[{table}.{key}] names {g!r}; the model's driven joints are {', '.join(sorted(groups))}")
+        return lambda g: values.get(g, values.get(g.rstrip("0123456789"), values.get("default")))
+
+    def torques(self, names):
+        """Hinge and limit of each motor: base by joint group times Table 4's scale; written into the motors' gear."""
+        m = self.model
+        driven = m.actuator_trnid[:, 0] - 1
+        if np.any(m.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT) or np.any(driven < 0) or len(set(driven)) < m.nu:
+            self.fail_xml("every actuator must be a motor on a hinge of its own")
+        groups = {joint_group(names[h]) for h in driven}
+        base, scale = (self.by_group("torque", key, groups) for key in ("base", "scale"))
+        limits = np.zeros(len(driven))
         for k, h in enumerate(driven):
             g = joint_group(names[h])
-            value = base.get(g, base.get(g.rstrip("0123456789"), base.get("default")))
-            if not isinstance(value, (int, float)) or value <= 0:
-                self.fail(f"[torque.base] has no positive value for {g} (nor a default); groups: {', '.join(groups)}")
-            out[k] = value * scale.get(g, 1.0)
-        self.model.actuator_gear[:, 0] = out
-        return out
+            if not base(g):
+                valid = ", ".join(sorted(groups))
+                self.fail(f"[torque.base] has no positive value for {g} (nor a default); driven joints: {valid}")
+            limits[k] = base(g) * (1.0 if scale(g) is None else scale(g))
+        m.actuator_gear[:, 0] = limits
+        return driven, limits
 
-    def passive(self, names, limits, driven):
-        """Passive spring, damper and armature of every hinge, as multiples of its torque limit."""
-        k, d = self.get("passive", "stiffness", float), self.get("passive", "damping", float)
-        armature = self.get("passive", "armature", dict)
+    def passive(self, names, driven, limits):
+        """Spring and damper of every driven hinge, as multiples of its torque limit, and its armature.
+
+        Hinges without a motor (tails, ears) keep what the MJCF gives them."""
+        m = self.model
+        k, d = (self.number(f"[passive] {key}", self.get("passive", key, float), 0) for key in ("stiffness", "damping"))
+        armature = self.by_group("passive", "armature", {joint_group(names[h]) for h in driven})
         for h, limit in zip(driven, limits, strict=True):
             g = joint_group(names[h])
-            a = armature.get(g, armature.get(g.rstrip("0123456789")))
-            if a is None:
-                self.fail(f"[passive] armature has no entry for {g}")
-            self.model.jnt_stiffness[1 + h], self.model.dof_damping[6 + h] = k * limit, d * limit
-            self.model.dof_armature[6 + h] = a
+            if armature(g) is None:
+                self.fail(f"[passive.armature] has no entry for {g}")
+            m.jnt_stiffness[1 + h], m.dof_damping[6 + h] = k * limit, d * limit
+            m.dof_armature[6 + h] = armature(g)
 
     def body_for(self, segment):
-        """The last body that follows a human segment."""
-        found = [b for b, e in self.spec["map"].items() if e.get("to") == segment]
+        """The last body of the map that follows a human segment."""
+        found = [b for b, e in self.spec["map"].items() if e["to"] == segment]
         if not found:
             self.fail(f"[map] has no body that follows the human's {segment}")
         return found[-1]
@@ -262,50 +347,68 @@ class _Loader:
         order = sorted(self.spec["map"], key=lambda b: self.bodies("map", [b])[0])
         for body in order:
             entry = self.spec["map"][body]
-            if not isinstance(entry, dict) or {"from", "to"} - set(entry) or set(entry) - {"from", "to", "x", "y", "z"}:
+            keys = {"from", "to", "x", "y", "z"}
+            if not isinstance(entry, dict) or {"from", "to"} - set(entry) or set(entry) - keys:
                 self.fail(f'[map] {body} must be {{ from = "…", to = "…" }} with optional x, y, z; found {entry!r}')
             for key in ("from", "to"):
-                if entry[key] not in SEG:
+                if entry[key] not in SEGMENTS:
                     self.fail(f"[map] {body}.{key} = {entry[key]!r}; valid human segments: {', '.join(SEGMENTS)}")
             b = int(self.bodies("map", [body])[0])
             hinges = np.arange(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]) - 1
-            if not len(hinges):
+            if b == m.jnt_bodyid[0] or not len(hinges):
                 self.fail(f"[map] body {body} has no hinge in {self.xml.name}")
             axes = "".join("xyz"[np.argmax(np.abs(m.jnt_axis[1 + h]))] for h in hinges)
             if len(set(axes)) != len(axes):
-                raise UserError(f"{self.xml}: body {body} has two hinges about one axis ({axes})")
-            out.append((b, hinges, axes, SEG[entry["from"]], SEG[entry["to"]], {a: entry[a] for a in "xyz" if a in entry}))
+                self.fail_xml(f"body {body} has two hinges about one axis ({axes})")
+            shares = {a: self.number(f"[map] {body}.{a}", entry[a]) for a in "xyz" if a in entry}
+            if set(shares) - set(axes):
+                extra = ", ".join(sorted(set(shares) - set(axes)))
+                self.fail(f"[map] {body} shares {extra}, but its hinges turn about {', '.join(axes)}")
+            out.append((b, hinges, axes, SEG[entry["from"]], SEG[entry["to"]], shares))
             mapped[hinges] = True
         return out, mapped
 
     def joint_weights(self, names, mapped):
         table = self.spec["reward"].get("joints", {})
+        if not isinstance(table, dict):
+            self.fail(f"[reward] joints = {table!r} is not a table of joint = weight")
         groups = {joint_group(n) for n in names}
-        for g in table:
+        for g, w in table.items():
             if g != "default" and g not in groups and g not in names:
                 self.fail(f"[reward.joints] names {g!r}; valid: default, {', '.join(sorted(groups))}, or a joint")
+            self.number(f"[reward.joints] {g}", w, 0)
         # what has no human motion is not imitated (§3.5.1)
         w = [table.get(n, table.get(joint_group(n), table.get("default", 1.0))) for n in names]
         return normalised(np.where(mapped, w, 0.0))
 
     def rewards(self):
-        out = {"fail": float(self.get("reward", "fail", float))}
+        """Table 2: term -> (w, k), and "fail"."""
+        valid = (*TERMS, "fail", "joints", "links")
+        for key in self.spec["reward"]:
+            if key not in valid:
+                self.fail(f"[reward] names {key!r}; valid: {', '.join(valid)}")
+        out = {"fail": self.get("reward", "fail", float)}
         for term in TERMS:
             pair = self.get("reward", term, list)
-            if len(pair) != 2 or not all(isinstance(v, (int, float)) and v >= 0 for v in pair):
+            if len(pair) != 2:
                 self.fail(f"[reward] {term} = {pair!r} must be [w, k], both at least 0")
-            out[term] = (float(pair[0]), float(pair[1]))
+            out[term] = tuple(float(self.number(f"[reward] {term} [w, k] {v!r}", v, 0)) for v in pair)
         return out
 
 
 def joint_group(name: str) -> str:
-    """hip_l_y -> hip, spine0_y -> spine0: the name Table 4 uses, in lower case."""
+    """hip_l_y -> hip, spine0_y -> spine0: the name Table 4 uses, in lower case.
+
+    Test      tests/test_retarget.py::test_character_tables"""
     return name.split("_")[0]
 
 
 def normalised(w):
     """Eq. 11's weights made to sum to 1, so that d is a mean.  ASSUMED: the one place where that is decided.
-    With the plain sum over 33 joints and k_q = 25, 0.1 rad everywhere would give e^-8 and no gradient; the mean gives e^-0.25."""
+    With the plain sum over 33 joints and k_q = 25, 0.1 rad everywhere would give e^-8 and no gradient; the mean
+    gives e^-0.25.
+
+    Test      tests/test_retarget.py::test_character_tables"""
     w = np.asarray(w, dtype=float)
     return w / w.sum() if w.sum() > 0 else w
 
@@ -367,7 +470,8 @@ def forward_kinematics(char: Character, qpos, qvel=None, chunk=1024) -> Kinemati
     qpos = np.atleast_2d(qpos)
     n = min(chunk, len(qpos))
     b = char.batch(n)
-    live = {k: b.bind(k) for k in ("qpos", "qvel", "xpos", "xquat", "cvel", "subtree_com", "site_xpos", "geom_xpos", "geom_xmat")}
+    names = ("qpos", "qvel", "xpos", "xquat", "cvel", "subtree_com", "site_xpos", "geom_xpos", "geom_xmat")
+    live = {k: b.bind(k) for k in names}
     parts = []
     for start in range(0, len(qpos), n):
         stop = min(start + n, len(qpos))
@@ -376,22 +480,24 @@ def forward_kinematics(char: Character, qpos, qvel=None, chunk=1024) -> Kinemati
         live["qvel"][:k] = 0.0 if qvel is None else qvel[start:stop]
         b.forward(np.arange(k), STAGE_VEL)
         gx, gm = live["geom_xpos"][:k], live["geom_xmat"][:k]
-        fall = geom_lowest(m, char.fall_geoms, gx, gm).min(1) if len(char.fall_geoms) else np.full(k, np.inf)
         parts.append((
             live["xpos"][:k].copy(),
             live["xquat"][:k].copy(),
             body_velocity(live["cvel"][:k], live["xpos"][:k], live["subtree_com"][:k, char.root]),
             live["site_xpos"][:k, char.sensor_sites],
             sole_points(char, gx, gm),
-            fall,
+            geom_lowest(m, char.fall_geoms, gx, gm).min(1),
         ))  # fmt: skip
     return Kinematics(*(np.concatenate(p) for p in zip(*parts, strict=True)))
 
 
 def sole_points(char: Character, xpos, xmat):
-    """End points of the feet's capsules (or corners of boxes), at the shape's lowest height.  -> (T, 2, p, 3) [m], world.
+    """Where the feet can touch the floor: ends of capsules and centres of spheres, lowered by the radius; box corners.
 
-    Test      tests/test_retarget.py::test_sole_points"""
+    Args      xpos (T, ngeom, 3); xmat (T, ngeom, 9), world
+    Returns   (T, 2, p, 3) [m], world
+    Test      tests/test_retarget.py::test_sole_points
+    """
     m, feet = char.model, []
     for foot in char.sole_geoms:
         points = []
@@ -399,8 +505,8 @@ def sole_points(char: Character, xpos, xmat):
             r = xmat[:, g].reshape(-1, 3, 3)
             radius, half = m.geom_size[g, 0], m.geom_size[g, 1]
             if m.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX:
-                corners = np.array([[sx, sy, sz] for sx in (-1, 1) for sy in (-1, 1) for sz in (-1, 1)]) * m.geom_size[g]
-                points += [xpos[:, g] + r @ c for c in corners]
+                signs = np.array([[sx, sy, sz] for sx in (-1, 1) for sy in (-1, 1) for sz in (-1, 1)])
+                points += [xpos[:, g] + r @ c for c in signs * m.geom_size[g]]
             else:
                 ends = (-half, half) if m.geom_type[g] == mujoco.mjtGeom.mjGEOM_CAPSULE else (0.0,)
                 points += [xpos[:, g] + r[:, :, 2] * h - [0.0, 0.0, radius] for h in ends]
@@ -423,17 +529,18 @@ def root_scale(char: Character, clip: Clip) -> np.ndarray:
 
 
 def euler_angles(q, axes: str):
-    r"""Angles of intrinsic turns about `axes` (1 to 3 letters) that make, or come closest to, the rotation q.
+    r"""Angles of intrinsic turns about `axes` (1 to 3 letters) that make the rotation q.
 
-    Equation  q = q_{a1}(α1) q_{a2}(α2) q_{a3}(α3); with fewer hinges than three the rotation about the missing axes, ordered
-              last, is dropped: what the character cannot do
-    Args      q (T, 4)
+    Equation  q = q_{a1}(α1) q_{a2}(α2) q_{a3}(α3); with fewer than three hinges the turns about the missing axes,
+              ordered last, are dropped: what the character cannot do (ASSUMED: not the nearest reachable rotation)
+    Args      q (T, 4); axes : letters of "xyz", none twice
     Returns   (T, len(axes)) [rad], unwrapped in time
     Test      tests/test_retarget.py::test_euler_angles
     """
     seq = axes + "".join(a for a in "yxz" if a not in axes)
     angles = Rotation.from_quat(q, scalar_first=True).as_euler(seq.upper())
-    # Two triples make one rotation; take the one that continues the last frame, so that no hinge turns by π at the pole.
+    # Two triples make one rotation; take the one with the smaller angles: an arm raised sideways by 150 degrees is
+    # (0, 150, 0), not (180, 30, 180).
     other = angles + np.array([np.pi, 0.0, np.pi])
     other[:, 1] = np.pi - angles[:, 1]
     wrap = lambda a: (a + np.pi) % (2 * np.pi) - np.pi  # noqa: E731
@@ -455,11 +562,13 @@ class Pose:
 def retarget(char: Character, clip: Clip) -> Pose:
     r"""Kinematic retargeting  [Reda23 §3.4].
 
-    Method    root: the human pelvis, position scaled by `root_scale`, orientation as it is.  Hinges: the human's rotation of one
-              segment relative to another, shared out along the character's chain as the TOML says; the last body of a chain takes
-              the rest, so that chest, head, arms and legs have the human's relative rotation exactly (as far as their hinges allow).
-              Hinges without a counterpart keep the default pose.  Angles are clipped to the joint ranges.
-    Frame     qpos: world; qvel: root linear velocity world, root angular velocity in the root's frame, as MuJoCo has them
+    Method    root: the human pelvis, position scaled by `root_scale`, orientation as it is.  Hinges: the human's
+              rotation of one segment relative to another, shared out along the character's chain as the TOML says;
+              the last body of a chain takes the rest, so that chest, head, arms and legs have the human's relative
+              rotation exactly (as far as their hinges allow).  Hinges without a counterpart keep the default pose.
+              Angles are clipped to the joint ranges.
+    Frame     qpos: world, quaternion w, x, y, z; qvel: root linear velocity in the world's frame, root angular
+              velocity in the root's, as MuJoCo has them
     Test      tests/test_retarget.py::test_retarget_reproduces_segments
     """
     n = len(clip)
@@ -492,10 +601,12 @@ class Reference:
     """All that the environment compares with, for F frames of one or more sequences laid end to end.
 
     first, last : (S,) frame indices of each sequence
-    World frame; positions of the human already mapped by `root_scale`; matrices as their first two columns (F, ., 3, 2).
+    World frame; positions of the human already mapped by `root_scale`; matrices as their first two columns
+    (F, ., 3, 2).
     """
 
     names: list
+    rate: float  # Hz, of every sequence
     first: np.ndarray
     last: np.ndarray
     qpos: np.ndarray  # (F, nq) float64
@@ -515,12 +626,19 @@ class Reference:
 
 
 def reference(char: Character, clips: list[Clip]) -> Reference:
-    """Retarget sequences and lay them end to end.  Test: tests/test_retarget.py::test_reference"""
+    """Retarget sequences and lay them end to end.
+
+    Raises    ValueError: no clips, or clips of different rates
+    Test      tests/test_retarget.py::test_reference
+    """
+    rates = {c.rate for c in clips}
+    if len(rates) != 1:
+        raise ValueError(f"expected clips of one rate, got {len(clips)} clips with the rates {sorted(rates)}")
     rows = [_reference_of(char, c) for c in clips]
     lengths = np.array([len(c) for c in clips])
     first = np.concatenate([[0], np.cumsum(lengths)[:-1]])
     joined = {k: np.concatenate([r[k] for r in rows]) for k in rows[0]}
-    return Reference([c.name for c in clips], first, first + lengths - 1, **joined)
+    return Reference([c.name for c in clips], rates.pop(), first, first + lengths - 1, **joined)
 
 
 def _reference_of(char, clip):
@@ -564,8 +682,9 @@ def artefacts(char: Character, clip: Clip, pose: Pose) -> dict:
     """What the kinematic pose does wrong and the policy must repair.
 
     Returns   limit_share : share of (frame, hinge) clipped; limits : hinge -> share, worst first;
-              slide_cm_s : mean speed of the sole while the human's foot is in contact; penetration_mm : mean depth over the frames
-              below the floor, below_share; float_mm : mean height of the sole while the human's foot is in contact
+              slide_cm_s : mean speed of the sole while the human's foot is in contact;
+              penetration_mm : mean depth of the lower sole over the frames where it is below the floor, and
+              below_share : their share; float_mm : mean height of the sole while the human's foot is in contact
     Test      tests/test_retarget.py::test_artefacts
     """
     height, speed = sole_motion(forward_kinematics(char, pose.qpos).soles, clip.rate)
@@ -596,10 +715,12 @@ class Options:
 
 
 def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360)):
-    """Images with the human (capsules) and the character side by side, 1.2 m apart.  -> list of (H, W, 3) uint8"""
+    """Images with the human (stick figure) and the character side by side, 1 m apart.  -> list of (H, W, 3) uint8
+
+    Test      tests/test_retarget.py::test_draw"""
     import render
 
-    shown = character(char.name if not str(char.name).endswith(".toml") else char.name, visual=True)
+    shown = character(char.path, visual=True)
     scene = render.Scene(shown.model, *size)
     data = mujoco.MjData(shown.model)
     images = []
@@ -607,7 +728,7 @@ def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360)):
         data.qpos[:] = pose.qpos[t]
         mujoco.mj_forward(shown.model, data)
         left = quat_rotate(clip.quat[t, 0], np.array([0.0, 1.0, 0.0])) * [1, 1, 0]
-        side = 1.0 * left / max(np.linalg.norm(left), 1e-9)
+        side = left / max(np.linalg.norm(left), 1e-9)
         points = np.concatenate([clip.pos[t], clip.ball[t]]) + side
         bones = list(mocap.PARENTS) + list(mocap.FEET)
         images.append(scene.frame(data, markers=render.stick_figure(points, bones)))
@@ -618,7 +739,10 @@ def main(argv=None):
     opt = cli(Options, argv, "retarget.py", __doc__)
     char = character(opt.character)
     clips = mocap.load(opt.motion, clips=opt.clips)
-    print(f"{char.name}: hips {char.hip_height:.3f} m, {char.j} hinges, {len(char.limits)} driven, {char.model.body_subtreemass[0]:.1f} kg")
+    print(
+        f"{char.name}: hips {char.hip_height:.3f} m, {char.j} hinges, {len(char.limits)} driven, "
+        f"{char.model.body_subtreemass[0]:.1f} kg"
+    )
     rows = []
     for clip in clips:
         pose = retarget(char, clip)
@@ -626,14 +750,17 @@ def main(argv=None):
         rows.append(a)
         limits = ", ".join(f"{h} {100 * s:.0f} %" for h, s in list(a["limits"].items())[:3]) or "none"
         print(
-            f"{clip.name:36s} {clip.seconds:6.1f} s  slide {a['slide_cm_s']:5.1f} cm/s  below floor {100 * a['below_share']:3.0f} % by {a['penetration_mm']:4.1f} mm  "
+            f"{clip.name:36s} {clip.seconds:6.1f} s  slide {a['slide_cm_s']:5.1f} cm/s  "
+            f"below floor {100 * a['below_share']:3.0f} % by {a['penetration_mm']:4.1f} mm  "
             f"sole in contact {a['float_mm']:5.1f} mm up  limits hit: {limits}"
         )
     if len(rows) > 1:
         mean = {k: np.nanmean([r[k] for r in rows]) for k in rows[0] if k != "limits"}
         print(
-            f"mean of {len(rows)}: slide {mean['slide_cm_s']:.1f} cm/s, below floor {100 * mean['below_share']:.0f} % of frames by {mean['penetration_mm']:.1f} mm, "
-            f"sole in contact {mean['float_mm']:.1f} mm up, limits hit {100 * mean['limit_share']:.2f} % of hinge frames"
+            f"mean of {len(rows)}: slide {mean['slide_cm_s']:.1f} cm/s, "
+            f"below floor {100 * mean['below_share']:.0f} % of frames by {mean['penetration_mm']:.1f} mm, "
+            f"sole in contact {mean['float_mm']:.1f} mm up, "
+            f"limits hit {100 * mean['limit_share']:.2f} % of hinge frames"
         )
     if opt.png or opt.video:
         import render

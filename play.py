@@ -1,0 +1,489 @@
+r"""Run a policy: measure it, look at it, record it  [Reda23 §4].
+
+    python play.py --character jesse --motion FOLDER --measure [--json OUT]     the table of spec/metrics, four rows
+    python play.py --character jesse --motion FOLDER --png OUT | --video OUT    headless pictures
+    python play.py --character jesse --motion FOLDER --view | --view web        MuJoCo's viewer: window or browser
+
+Rows of the table: `policy` (its mean action), `kinematic` (the retargeted pose itself), `zero` (no torque) and `pd`
+(open-loop PD tracking of the reference).  Targets and labels are the human's for all rows.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+import mocap
+import retarget
+from env import EPISODE_STEPS, Env
+from mocap import quat_angle, quat_conj, quat_mul, quat_rotate
+from ppo import check_fits, load_policy
+from retarget import Character, Reference, forward_kinematics, sole_motion
+from runs import NONNEGATIVE, POSITIVE, UserError, arg, atomic_write, cli, run_main
+
+
+@dataclass
+class Options:
+    character: str = arg("jesse", "name in characters/, or path of a .toml")
+    motion: str = arg("builtin", "builtin, a .bvh file, or a folder of them")
+    clips: str = arg("*", "shell pattern on clip names")
+    policy: str | None = arg(None, "run folder or policy .npz; characters/NAME.npz by default")
+    measure: bool = arg(False, "print every metric for policy, kinematic, zero and pd")
+    json: str | None = arg(None, "write the measured table here")
+    all: bool = arg(False, "every sequence of the motion, not only its validation part")
+    split: str = arg(
+        "validation",
+        "which part: train, validation (unseen clips), style (unseen style)",
+        choices=("train", "validation", "style"),
+    )
+    random_starts: int = arg(
+        256, "characters started at random frames for the time to failure (0: leave it out)", check=NONNEGATIVE
+    )
+    sequence: int = arg(0, "which sequence to show", check=NONNEGATIVE)
+    seconds: float = arg(10.0, "how much of it to show", check=POSITIVE)
+    every: float = arg(0.5, "seconds between the pictures of the contact sheet", check=POSITIVE)
+    png: str | None = arg(None, "write a contact sheet")
+    video: str | None = arg(None, "write a video (.mp4; needs the extra `view`)")
+    view: str | None = arg(
+        None, "show it live: window (MuJoCo's viewer) or web (in a browser)", choices=("window", "web")
+    )
+    port: int = arg(0, "port of the browser viewer, 0 = the first free one from 8080", check=NONNEGATIVE)
+    seed: int = arg(0, "seed of stitching and random starts", check=NONNEGATIVE)
+    threads: int = arg(0, "physics threads, 0 = all cores", check=NONNEGATIVE)
+
+
+# ------------------------------------------------------------------------------------ what drives the character
+
+PD_STIFFNESS, PD_DAMPING = 4.0, 0.2  # per rad and per rad/s, in multiples of the torque limit; ASSUMED
+
+
+def policy_action(policy):
+    """The policy's mean action."""
+    return lambda env: policy.mean_action(env.full[:, : env.obs_size])
+
+
+def zero_action(env: Env):
+    """No torque: what the passive springs alone do."""
+    return np.zeros((env.n, env.action_size))
+
+
+def pd_action(env: Env):
+    r"""Open-loop tracking of the kinematic pose, gains in multiples of the torque limit.
+
+    Equation  a = clip(K (q* − q) + D (q̇* − q̇))
+
+    Test      tests/test_play.py::test_pd_action
+    """
+    h, f = env.char.driven, env.frame
+    error = env.ref.qpos[f, 7:] - env.qpos[:, 7:]
+    rate = env.ref.qvel[f, 6:] - env.qvel[:, 6:]
+    return np.clip(PD_STIFFNESS * error + PD_DAMPING * rate, -1.0, 1.0)[:, h]
+
+
+# ------------------------------------------------------------------------------------ running
+
+
+@dataclass
+class Recording:
+    """What a character did on one sequence.
+
+    frames : (T,) reference frames, the start included; qpos (T, nq); contact (T, 2) bool; action (T, u), of the step
+    that led to the frame (zero at the start); failed : bool; available : steps the sequence had to offer
+    """
+
+    frames: np.ndarray
+    qpos: np.ndarray
+    contact: np.ndarray
+    action: np.ndarray
+    failed: bool
+    available: int
+
+
+def simulate(char: Character, ref: Reference, act, horizon=EPISODE_STEPS, threads=0, only=None) -> list[Recording]:
+    """Run every sequence from its first frame, to its end, to `horizon` control steps, or to failure.
+
+    Args      act : function of the Env -> actions (N, u); only : indices of sequences, or None for all
+    Returns   one Recording a sequence; the state that failed is not part of it
+    Test      tests/test_play.py::test_simulate
+    """
+    first = ref.first if only is None else ref.first[only]
+    env = Env(char, ref, len(first), threads=threads, horizon=horizon, autoreset=False)
+    env.reset(frames=first)
+    available = env.available.copy()
+    alive = np.ones(env.n, bool)
+    qpos, contact, action = [env.qpos.copy()], [env.ref.contact[env.frame]], [np.zeros((env.n, env.action_size))]
+    lived, failed = np.zeros(env.n, int), np.zeros(env.n, bool)
+    while alive.any():
+        _, _, terminated, truncated, _ = env.step(act(env))
+        qpos.append(env.qpos.copy()), contact.append(env.contact.copy()), action.append(env.action.copy())
+        failed |= alive & terminated
+        lived += alive & ~terminated
+        alive &= ~(terminated | truncated)
+    qpos, contact, action = np.stack(qpos, 1), np.stack(contact, 1), np.stack(action, 1)
+    return [
+        Recording(
+            f + np.arange(k + 1),
+            qpos[i, : k + 1],
+            contact[i, : k + 1],
+            action[i, : k + 1],
+            bool(failed[i]),
+            int(available[i]),
+        )
+        for i, (f, k) in enumerate(zip(first, lived, strict=True))
+    ]
+
+
+def kinematic(char: Character, ref: Reference, horizon=EPISODE_STEPS) -> list[Recording]:
+    """The retargeted pose itself, as if it were a character; its contact is height < 2 cm and speed < 0.4 m/s."""
+    out = []
+    for a, b in zip(ref.first, ref.last, strict=True):
+        frames = np.arange(a, min(b, a + horizon) + 1)
+        height, speed = sole_motion(forward_kinematics(char, ref.qpos[frames]).soles, mocap.CONTROL_RATE)
+        contact = (height < 0.02) & (speed < mocap.CONTACT_SPEED)
+        out.append(
+            Recording(
+                frames, ref.qpos[frames], contact, np.zeros((len(frames), len(char.limits))), False, len(frames) - 1
+            )
+        )
+    return out
+
+
+def time_to_failure(char, ref, act, n=256, seconds=20.0, seed=0, threads=0) -> float:
+    r"""Mean time to failure from random starts: seconds lived by all ÷ failures; infinite if none failed.
+
+    Test      tests/test_play.py::test_time_to_failure
+    """
+    env = Env(char, ref, n, seed=seed, threads=threads)
+    env.reset(seed)
+    failures, steps = 0, int(seconds / env.dt)
+    for _ in range(steps):
+        failures += int(env.step(act(env))[2].sum())
+    return n * steps * env.dt / failures if failures else float("inf")
+
+
+# ------------------------------------------------------------------------------------ metrics: one function each
+
+
+def distance(a, b):
+    """Mean Euclidean distance.  (..., 3) -> float"""
+    return float(np.linalg.norm(a - b, axis=-1).mean())
+
+
+def jitter(x, rate):
+    r"""Mean over joints and frames of ‖x_{t+3} − 3x_{t+2} + 3x_{t+1} − x_t‖ / dt³.  x (T, J, 3) -> sum, count.
+
+    Test      tests/test_play.py::test_metrics_on_known_motion
+    """
+    d = np.linalg.norm(np.diff(x, n=3, axis=0), axis=-1) * rate**3
+    return d.sum(), d.size
+
+
+def footfalls(contact):
+    """How often a foot begins to touch.  contact (T, 2) bool -> int"""
+    return int(np.sum(contact[1:] & ~contact[:-1]))
+
+
+def travelled(root):
+    """Length of the root's path on the floor [m].  (T, 3) -> float"""
+    return float(np.linalg.norm(np.diff(root[:, :2], axis=0), axis=-1).sum())
+
+
+def local_rotations(quat, parents):
+    """Rotation of each body in its parent.  quat (T, b, 4), parents (b,) -> (T, b, 4)"""
+    return quat_mul(quat_conj(quat[:, parents]), quat)
+
+
+def head_rates(quat, rate):
+    """Roll and yaw velocity of the head about its own axes.  (T, 4) -> (T, 2) [rad/s]"""
+    return quat_rotate(quat_conj(quat), mocap.angular_velocity(quat, rate))[:, [0, 2]]
+
+
+def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dict:
+    """Every metric of spec/metrics over recordings, pooled over their frames.
+
+    Frames lived count equally, whichever clip they are in; `completed` and `survival` say how many were lived.
+    Test      tests/test_play.py::test_metrics_of_kinematic, test_metrics_on_known_motion
+    """
+    m, rate = char.model, mocap.CONTROL_RATE
+    bodies = np.array(sorted({b for b, *_ in char.chains}))
+    parents = m.body_parentid
+    sip = np.array([mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, n) for n in char.spec["metrics"]["sip"]])
+    rows, sums = [], {}
+    add = lambda key, total, count: sums.__setitem__(key, np.add(sums.get(key, (0.0, 0)), (total, count)))  # noqa: E731
+    mean_over = lambda key, values: add(key, float(np.sum(values)), np.size(values))  # noqa: E731
+    for rec in recordings:
+        f = rec.frames
+        sim, kin = forward_kinematics(char, rec.qpos), forward_kinematics(char, ref.qpos[f])
+        rows.append((not rec.failed, (len(f) - 1) / rec.available if rec.available else 1.0))
+        mean_over("root_cm", 100 * np.linalg.norm(rec.qpos[:, :3] - ref.qpos[f, :3], axis=-1))
+        sites = 100 * np.linalg.norm(sim.site_xpos - ref.sensor_pos[f], axis=-1)
+        mean_over("head_cm", sites[:, 0])
+        mean_over("hands_cm", sites[:, 1:])
+        aligned = lambda k: k.xpos[:, bodies] - k.xpos[:, char.root, None]  # noqa: E731
+        mean_over("joint_pos_cm", 100 * np.linalg.norm(aligned(sim) - aligned(kin), axis=-1))
+        mean_over("head_deg", np.degrees(quat_angle(sim.xquat[:, char.head], ref.orientation[f, 1])))
+        local = [local_rotations(k.xquat, parents)[:, bodies] for k in (sim, kin)]
+        mean_over("joint_rot_deg", np.degrees(quat_angle(*local)))
+        mean_over("sip_deg", np.degrees(quat_angle(sim.xquat[:, sip], kin.xquat[:, sip])))
+        height, speed = sole_motion(sim.soles, rate)
+        mean_over("foot_slide_cm_s", 100 * speed[ref.contact[f]])
+        lowest = np.minimum(height.min(1), sim.fall_height)
+        mean_over("penetration_mm", -1000 * lowest[lowest < 0])
+        mean_over("contact_agreement", rec.contact[1:] == ref.contact[f[1:]])
+        add("jitter_m_s3", *jitter(sim.xpos[:, bodies], rate))
+        add("human_jitter_m_s3", *jitter(ref.human_pos[f].astype(float), rate))
+        add("steps_per_m", footfalls(rec.contact), travelled(rec.qpos))
+        add("human_steps_per_m", footfalls(ref.contact[f]), travelled(ref.human_pos[f, 0]))
+        if len(f) > 2:
+            wobble = head_rates(sim.xquat[:, char.head], rate) - head_rates(ref.orientation[f, 1], rate)
+            mean_over("head_wobble_deg_s", np.degrees(wobble) ** 2)
+        mean_over("torque_rms", rec.action[1:] ** 2)
+        mean_over("saturation", np.abs(rec.action[1:]) > 0.99)
+    out = {
+        "clips": len(recordings),
+        "completed": float(np.mean([r[0] for r in rows])),
+        "survival": float(np.mean([r[1] for r in rows])),
+    }
+    out |= {k: float(total / count) if count else 0.0 for k, (total, count) in sums.items()}
+    for root in ("head_wobble_deg_s", "torque_rms"):
+        out[root] = float(np.sqrt(out.get(root, 0.0)))
+    return out
+
+
+COLUMNS = (  # key, heading, format
+    ("completed", "completed", "{:.2f}"),
+    ("survival", "survival", "{:.2f}"),
+    ("fails_every_s", "fails every s", "{:.2f}"),
+    ("root_cm", "root cm", "{:.1f}"),
+    ("head_cm", "head cm", "{:.1f}"),
+    ("hands_cm", "hands cm", "{:.1f}"),
+    ("joint_pos_cm", "joints cm", "{:.1f}"),
+    ("head_deg", "head °", "{:.1f}"),
+    ("joint_rot_deg", "joints °", "{:.1f}"),
+    ("sip_deg", "SIP °", "{:.1f}"),
+    ("foot_slide_cm_s", "slide cm/s", "{:.1f}"),
+    ("penetration_mm", "below mm", "{:.1f}"),
+    ("contact_agreement", "contact", "{:.2f}"),
+    ("jitter_m_s3", "jitter m/s³", "{:.0f}"),
+    ("steps_per_m", "steps/m", "{:.2f}"),
+    ("head_wobble_deg_s", "wobble °/s", "{:.0f}"),
+    ("torque_rms", "torque rms", "{:.2f}"),
+    ("saturation", "saturation", "{:.3f}"),
+)
+
+
+def table(results: dict) -> str:
+    """The rows as Markdown.  The kinematic row completes by definition and has no torque: printed as a dash."""
+    lines = ["| | " + " | ".join(h for _, h, _ in COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
+    for name, row in results.items():
+        dash = {"completed", "survival", "fails_every_s", "torque_rms", "saturation"} if name == "kinematic" else set()
+        cells = [
+            "-" if k in dash or k not in row else "never" if row[k] == np.inf else fmt.format(row[k])
+            for k, _, fmt in COLUMNS
+        ]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    human = next(iter(results.values()))
+    lines.append(
+        f"\nthe human: jitter {human['human_jitter_m_s3']:.0f} m/s³, {human['human_steps_per_m']:.2f} steps/m; "
+        f"{human['clips']} sequences"
+    )
+    return "\n".join(lines)
+
+
+def measure_all(char, ref, policy, opt: Options) -> dict:
+    """The four rows.  Test: tests/test_play.py::test_measure_json"""
+    actions = {"policy": policy_action(policy)} if policy else {}
+    actions |= {"kinematic": None, "zero": zero_action, "pd": pd_action}
+    out = {}
+    for name, act in actions.items():
+        recordings = simulate(char, ref, act, threads=opt.threads) if act else kinematic(char, ref)
+        out[name] = measure(char, ref, recordings)
+        if act and opt.random_starts:
+            out[name]["fails_every_s"] = time_to_failure(
+                char, ref, act, opt.random_starts, seed=opt.seed, threads=opt.threads
+            )
+    return out
+
+
+# ------------------------------------------------------------------------------------ looking
+
+
+def pictures(char: Character, ref: Reference, recording: Recording, frames, size=(480, 360), fast=False):
+    """Images (H, W, 3) of the character with the three sensor poses it was given; frames : indices into the recording."""
+    import render
+
+    shown = retarget.character(char.path, visual=True).model
+    scene = render.Scene(shown, *size, fast=fast)
+    data = mujoco.MjData(shown)
+    images = []
+    for t in frames:
+        data.qpos[:] = recording.qpos[t]
+        mujoco.mj_forward(shown, data)
+        f = recording.frames[t]
+        images.append(scene.frame(data, markers=render.device_markers(ref.sensor_pos[f], ref.sensor_quat[f])))
+    return images
+
+
+def show(char: Character, ref: Reference, policy, sequence: int, how: str, port: int) -> None:
+    """Run the policy in real time in MuJoCo's viewer until it is closed; over again at the sequence's end or a failure.
+
+    The environment steps the physics; the viewer only draws the states it is sent, the three sensor poses as boxes.
+
+    Args      how : "window" (needs a display) or "web" (serves a page; needs none)
+              port : of the page, 0 = the first free one from 8080
+    Raises    UserError: no display, or the port is taken
+    Test      tests/test_play_view.py::test_web_view
+    """
+    import time
+
+    shown = _shown_model(char, ref)
+    data = mujoco.MjData(shown)
+    env = Env(char, ref, 1, threads=1, horizon=len(ref), autoreset=False)
+    act = policy_action(policy)
+    start = ref.first[[sequence]]
+    env.reset(frames=start)
+
+    def pose():
+        data.qpos[:], data.mocap_pos[:] = env.qpos[0], ref.sensor_pos[env.frame[0]]
+        data.mocap_quat[:] = ref.sensor_quat[env.frame[0]]
+        mujoco.mj_forward(shown, data)
+
+    pose()
+    with _open_viewer(shown, data, char.root, how, port) as handle:
+        clock = time.perf_counter()
+        while handle.is_running():
+            handle.sync()
+            _, _, terminated, truncated, _ = env.step(act(env))
+            if terminated[0] or truncated[0]:
+                why = "fell or lost the user" if terminated[0] else "reached the end"
+                print(f"{why} after {env.steps[0] * env.dt:.1f} s; again", flush=True)
+                env.reset(frames=start)
+            data.time += env.dt
+            pose()
+            clock = max(clock + env.dt, time.perf_counter() - 0.5)
+            time.sleep(max(0.0, clock - time.perf_counter()))
+
+
+def _shown_model(char: Character, ref: Reference):
+    """The character with its visual shapes, and a box with axes for each sensor, to be placed as mocap bodies."""
+    import render
+
+    spec = mujoco.MjSpec.from_file(str(char.path.parent / char.spec.get("model", char.path.stem + ".xml")))
+    for i, device in enumerate(render.device_markers(ref.sensor_pos[0], ref.sensor_quat[0])):
+        body = spec.worldbody.add_body(name=f"sensor {i}", mocap=True)
+        look = dict(contype=0, conaffinity=0, group=1)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=device.size, rgba=device.rgba, **look)
+        for axis in np.eye(3):
+            end = [0.0, 0.0, 0.0, *(2.5 * max(device.size) * axis)]
+            size = [0.15 * max(device.size), 0.0, 0.0]
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=end, size=size, rgba=[*axis, 1.0], **look)
+    return spec.compile()
+
+
+def _open_viewer(model, data, root, how, port):
+    """A handle with is_running(), sync() and close(); the camera follows the body `root`, collision shapes are hidden."""
+    import warnings
+
+    def look(camera, option):
+        camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, root
+        camera.distance, camera.azimuth, camera.elevation = 3.5, 135, -15
+        option.geomgroup[3] = 0
+        return camera, option
+
+    if how == "window":
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the reason goes into the error
+                import glfw
+                from mujoco import viewer
+
+                if not glfw.init():  # MuJoCo would wait for ever
+                    raise RuntimeError(glfw.get_error()[1].decode())
+            handle = viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+        except (ImportError, RuntimeError) as error:
+            raise UserError(f"no window can be opened ({error}); --view web shows it in a browser") from None
+        with handle.lock():
+            look(handle.cam, handle.opt)
+        return handle
+    try:
+        from mujoco.studio import launch_thread, viewer_protocol, web_viewer
+        from mujoco.studio.web import web_server
+
+        web_server.bind_public_socket("::", port).close()  # a taken port: seen here, not in the viewer's thread
+    except (ImportError, RuntimeError, OverflowError) as error:
+        raise UserError(f"no page can be served on port {port}: {error}") from None
+
+    def serve(endpoint):
+        camera, option = look(mujoco.MjvCamera(), mujoco.MjvOption())
+        config = viewer_protocol.ViewerConfig(gfx="web", http_port=port)
+        page = web_viewer.WebViewer(config, endpoint, model=model, camera=camera, vis_options=option)
+        viewer_protocol.run_viewer_loop(page)
+
+    handle = launch_thread.launch_thread(serve)
+    handle.set_model(model, data=data)
+    return handle
+
+
+# ------------------------------------------------------------------------------------ command line
+
+
+def find_policy(opt: Options):
+    """The policy named, or the shipped one; UserError says how to make one."""
+    path = Path(opt.policy) if opt.policy else retarget.CHARACTERS / f"{Path(opt.character).stem}.npz"
+    if not path.exists():
+        raise UserError(
+            f"no policy {path}: train one (python ppo.py --character {opt.character} --out runs/a), then --policy runs/a"
+        )
+    return load_policy(path)[0], path
+
+
+def main(argv=None):
+    argv = list(argv or [])
+    for i, a in enumerate(argv):  # --view alone means a window
+        if a == "--view" and (i + 1 == len(argv) or argv[i + 1].startswith("--")):
+            argv[i] = "--view=window"
+    opt = cli(Options, argv, "play.py", __doc__)
+    if not (opt.measure or opt.png or opt.video or opt.view):
+        raise UserError("nothing to do: give --measure, --png OUT, --video OUT or --view")
+    char = retarget.character(opt.character)
+    policy, path = find_policy(opt)
+    clips = mocap.sequences(opt.motion, "all" if opt.all else opt.split, opt.clips, seed=opt.seed)
+    if opt.sequence >= len(clips):
+        raise UserError(f"--sequence {opt.sequence}: there are {len(clips)}, from 0")
+    ref = retarget.reference(char, clips)
+    check_fits(policy, Env(char, ref, 1), path)
+    if opt.measure:
+        results = measure_all(char, ref, policy, opt)
+        print(table(results))
+        if opt.json:
+            clean = {n: {k: v if np.isfinite(v) else None for k, v in row.items()} for n, row in results.items()}
+            atomic_write(opt.json, json.dumps(clean, indent=2) + "\n")
+    if opt.png or opt.video:
+        import render
+
+        recording = simulate(char, ref, policy_action(policy), threads=opt.threads, only=[opt.sequence])[0]
+        last = min(len(recording.frames) - 1, int(opt.seconds * mocap.CONTROL_RATE))
+        print(
+            f"{ref.names[opt.sequence]}: lived {(len(recording.frames) - 1) / mocap.CONTROL_RATE:.1f} s "
+            f"of {recording.available / mocap.CONTROL_RATE:.1f}"
+        )
+        if opt.png:
+            frames = np.arange(0, last + 1, max(1, round(opt.every * mocap.CONTROL_RATE)))
+            labels = [f"{t / mocap.CONTROL_RATE:.1f} s" for t in frames]
+            render.write_png(opt.png, render.contact_sheet(pictures(char, ref, recording, frames), labels, 5))
+            print(opt.png)
+        if opt.video:
+            render.write_video(
+                opt.video, pictures(char, ref, recording, range(last + 1), (640, 480), fast=True), mocap.CONTROL_RATE
+            )
+            print(opt.video)
+    if opt.view:
+        show(char, ref, policy, opt.sequence, opt.view, opt.port)
+
+
+if __name__ == "__main__":
+    run_main(main)

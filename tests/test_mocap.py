@@ -1,0 +1,750 @@
+"""mocap.py against SciPy's rotations, slow loops, hand values and a walk written as other skeletons' files.
+
+Tests on recorded motion find it through the environment variable MOCAP_DIR; without it they are skipped.
+"""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+import bvh
+import gait
+import mocap
+from mocap import FEET, PARENTS, RIGS, SEG, SEGMENTS, Clip
+from runs import UserError
+
+# ---------------------------------------------------------------- helpers
+
+TO_FILE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # our x, y, z (forward, left, up) -> file x left, y up, z forward
+
+
+def rot(q):
+    return Rotation.from_quat(np.asarray(q), scalar_first=True)
+
+
+def some_quats(n, seed=0):
+    return Rotation.random(n, random_state=seed).as_quat(scalar_first=True)
+
+
+def walk(seconds=8.0, rate=30.0, seed=3, kind="walk", name="walk_001", body="a", **params) -> Clip:
+    m = gait.generate(kind, seconds, rate, seed=seed, **params)
+    return Clip(name, body, m["rate"], m["pos"], m["quat"], m["ball"])
+
+
+def still(n, rate=30.0) -> Clip:
+    """An upright human at rest: every frame at the world's axes."""
+    m = gait.generate("stand", 4.0, 30.0, seed=0, variation=0.0)
+    quat = np.tile([1.0, 0, 0, 0], (n, 15, 1))
+    return Clip("still", "a", rate, np.repeat(m["pos"][:1], n, 0), quat, np.repeat(m["ball"][:1], n, 0))
+
+
+def angle(vectors, axis):
+    """Degrees between vectors and an axis."""
+    v = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.degrees(np.arccos(np.clip(v @ np.asarray(axis, float), -1, 1)))
+
+
+def assert_same(a: Clip, b: Clip, atol=1e-6):
+    assert len(a) == len(b) and a.rate == pytest.approx(b.rate, rel=1e-6)
+    np.testing.assert_allclose(a.pos, b.pos, rtol=0, atol=atol)
+    np.testing.assert_allclose(a.ball, b.ball, rtol=0, atol=atol)
+    assert mocap.quat_angle(a.quat, b.quat).max() < 4 * atol
+
+
+def write_as(path, rig_name, clip, order="ZYX", six=False, root_offset=None, rename=None):
+    """Write a canonical clip as a BVH of a rig: matrices and Euler angles only.
+
+    The rig's joints stand in the file's axes as its table says: joint axes = file axes of (forward, left, up), the
+    forward one pitched down.  six: position channels everywhere and wrong OFFSETs; root_offset: "relative" stores the
+    root's positions relative to its OFFSET, "absolute" repeats the first frame as OFFSET although channels are absolute.
+    """
+    rig, rotation, position, names, parents = RIGS[rig_name], [], [], [], []
+    if "joint_Root" in rig.signature:
+        names, parents = ["joint_Root"], [-1]
+        rotation, position = [np.tile(np.eye(3), (len(clip), 1, 1))], [np.zeros((len(clip), 3))]
+    world = rot(clip.quat.reshape(-1, 4)).as_matrix().reshape(len(clip), 15, 3, 3)
+    for i, segment in enumerate(SEGMENTS):
+        table = np.stack([mocap._axis(a) for a in rig.axes[segment]], axis=1)
+        down = Rotation.from_euler("y", rig.pitch.get(segment, 0.0), degrees=True).as_matrix()
+        first = len(names) - i
+        names.append(rig.joints[segment])
+        parents.append(PARENTS[i] + first if i else first - 1)
+        rotation.append(TO_FILE @ world[:, i] @ down @ table.T)
+        p = clip.pos[:, i] + (world[:, 0] @ [0.02, 0.0, 0.08] if i == 0 else 0.0)  # its hips joint lies elsewhere
+        position.append(100.0 * p @ TO_FILE.T)
+    for j, ball in enumerate(rig.balls):
+        foot = names.index(rig.joints["foot_" + "lr"[j]])
+        names.append(ball)
+        parents.append(foot)
+        rotation.append(rotation[foot])
+        position.append(100.0 * clip.ball[:, j] @ TO_FILE.T)
+    children = {j: [k for k, p in enumerate(parents) if p == j] for j in range(len(names))}
+    lines, rows = ["HIERARCHY"], []
+
+    def joint(j):
+        p = parents[j]
+        if p < 0:
+            r, x = rotation[j], position[j]
+        else:
+            r = np.einsum("tji,tjk->tik", rotation[p], rotation[j])
+            x = np.einsum("tji,tj->ti", rotation[p], position[j] - position[p])
+        offset = [3.0, 1.0, 2.0] if six else x.mean(0) if p >= 0 else x[0] if root_offset else np.zeros(3)
+        channels = [a + "rotation" for a in order]
+        values = Rotation.from_matrix(r).as_euler(order, degrees=True)
+        if six or p < 0:
+            channels, values = channels + ["Zposition", "Xposition", "Yposition"], np.hstack([values, x[:, [2, 0, 1]]])
+            if root_offset == "relative":
+                values[:, 3:] -= offset[[2, 0, 1]]
+        rows.append(values)
+        lines.extend([f"{'ROOT' if p < 0 else 'JOINT'} {(rename or {}).get(names[j], names[j])}", "{"])
+        lines.append("OFFSET " + " ".join(f"{v:.9f}" for v in offset))
+        lines.append(f"CHANNELS {len(channels)} {' '.join(channels)}")
+        for k in children[j]:
+            joint(k)
+        lines.extend(["}"] if children[j] else ["End Site", "{", "OFFSET 0 0 0", "}", "}"])
+
+    joint(0)
+    lines += ["MOTION", f"Frames: {len(clip)}", f"Frame Time: {1 / clip.rate:.10f}"]
+    lines += [" ".join(f"{v:.9f}" for v in row) for row in np.hstack(rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+# ---------------------------------------------------------------- quaternions
+
+
+def test_quaternions():
+    a, b = some_quats(200, 1), some_quats(200, 2)
+    v = np.random.default_rng(3).standard_normal((200, 3))
+    for sign in (1, -1):  # q and -q are one rotation
+        np.testing.assert_allclose(mocap.quat_rotate(sign * a, v), rot(a).apply(v), atol=1e-12)
+        np.testing.assert_allclose(mocap.quat_matrix(sign * a), rot(a).as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(mocap.quat_angle(sign * a, b), (rot(a) * rot(b).inv()).magnitude(), atol=1e-12)
+        assert mocap.quat_angle(sign * a, a).max() < 1e-7
+    product = rot(mocap.quat_mul(a, b)).as_matrix()
+    np.testing.assert_allclose(product, (rot(a) * rot(b)).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rot(mocap.quat_conj(a)).as_matrix(), rot(a).inv().as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(mocap.quat_mul(a, b)[..., 0], np.sum(mocap.quat_conj(a) * b, -1), atol=1e-12)
+    for axis, letter in enumerate("xyz"):
+        for degrees in (0, 30, -90, 179, 180):
+            q = mocap.quat_about(axis, np.radians(degrees))
+            want = Rotation.from_euler(letter, degrees, degrees=True).as_matrix()
+            np.testing.assert_allclose(rot(q).as_matrix(), want, atol=1e-12)
+            assert mocap.quat_angle(q, [1.0, 0, 0, 0]) == pytest.approx(np.radians(abs(degrees)), abs=1e-12)
+    # batches broadcast as NumPy arrays do
+    grid = mocap.quat_mul(a[:6].reshape(2, 3, 4), b[:3])
+    np.testing.assert_allclose(grid[1, 2], mocap.quat_mul(a[5], b[2]), atol=0)
+
+
+def test_velocities():
+    rate, omega = 50.0, np.array([1.0, -2.0, 3.0])
+    t = np.arange(40) / rate
+    start = rot(some_quats(1, 5)[0])
+    q = (Rotation.from_rotvec(t[:, None] * omega) * start).as_quat(scalar_first=True)  # turns about a WORLD axis
+    q[::3] *= -1
+    np.testing.assert_allclose(mocap.angular_velocity(q, rate), np.tile(omega, (40, 1)), atol=1e-9)
+
+    # an irregular motion of several segments, frame by frame
+    wild = np.cumsum(np.random.default_rng(0).normal(0, 0.2, (30, 2, 3)), axis=0)
+    q = Rotation.from_rotvec(wild.reshape(-1, 3)).as_quat(scalar_first=True).reshape(30, 2, 4)
+    got = mocap.angular_velocity(q, rate)
+    for i in range(30):
+        for j in range(2):
+            a, b = max(i - 1, 0), min(i + 1, 29)
+            want = (rot(q[b, j]) * rot(q[a, j]).inv()).as_rotvec() * rate / (b - a)
+            np.testing.assert_allclose(got[i, j], want, atol=1e-9)
+    assert not mocap.angular_velocity(np.tile([1.0, 0, 0, 0], (5, 1)), rate).any()
+
+    x = np.stack([t**2, np.sin(t), 3 * t], axis=-1)
+    v = mocap.linear_velocity(x, rate)
+    np.testing.assert_allclose(v[1:-1, 0], 2 * t[1:-1], atol=1e-9)  # exact for a parabola
+    np.testing.assert_allclose(v, np.gradient(x, 1 / rate, axis=0), atol=1e-9)
+    assert (mocap.linear_velocity(x[:1], rate) == 0).all() and mocap.angular_velocity(q[:1], rate).shape == (1, 2, 3)
+    np.testing.assert_allclose(mocap.linear_velocity(x[:2], rate), np.tile((x[1] - x[0]) * rate, (2, 1)), atol=1e-12)
+
+
+def test_heading_does_not_flip():
+    pitch = np.arange(-175, 176, 5)
+    for yaw in (-170, -90, -20, 0, 45, 135, 180):
+        q = Rotation.from_euler("ZY", np.stack([np.full(len(pitch), yaw), pitch], -1), degrees=True)
+        q = q.as_quat(scalar_first=True)
+        q[::2] *= -1
+        off = np.degrees(mocap.heading(q)) - yaw
+        np.testing.assert_allclose((off + 180) % 360 - 180, 0, atol=1e-6)
+    # the projected forward axis does flip: bent over by more than 90 degrees, the forward axis points backwards
+    assert rot(mocap.quat_about(1, np.radians(100))).apply([1, 0, 0])[0] < 0
+    # leaning sideways turns nothing either, and an upright root's heading is its yaw
+    lean = Rotation.from_euler("ZX", [[30, r] for r in (-80, -20, 0, 50, 80)], degrees=True)
+    np.testing.assert_allclose(mocap.heading(lean.as_quat(scalar_first=True)), np.radians(30), atol=1e-12)
+    clip = walk(4.0)
+    yaw = rot(clip.quat[:, 0]).as_euler("ZXY")[:, 0]  # Z then X then Y: the last turn is the one about the left axis
+    np.testing.assert_allclose(mocap.heading(clip.quat[:, 0]), yaw, atol=1e-9)
+
+
+# ---------------------------------------------------------------- reading
+
+
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("order, six, rate", [("ZYX", False, 30.0), ("XZY", True, 60.0), ("YXZ", False, 120.0)])
+def test_same_human_from_any_file(tmp_path, rig, order, six, rate):
+    """One walk written in each rig, with any channel order, by OFFSET or by position channels, comes back as itself."""
+    clip = walk(3.0, rate, turn_rate=0.4)
+    path = write_as(tmp_path / "walk_001.bvh", rig, clip, order, six)
+    got = mocap.from_bvh(path)
+    assert_same(got, clip)
+    assert got.name == "walk_001" and got.body == f"{rig}-leg86-arm58"  # 0.491 and 0.332 of 1.75 m
+    np.testing.assert_array_equal(mocap.contacts(got), mocap.contacts(clip))
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_rigs_stand_upright(tmp_path, rig):
+    """Hand values: in a standing person's file every anatomical frame is the world's, whatever the joints' own axes."""
+    got = mocap.from_bvh(write_as(tmp_path / "stand.bvh", rig, still(3)))
+    assert mocap.quat_angle(got.quat, [1.0, 0, 0, 0]).max() < 1e-6
+    for segment in SEGMENTS:
+        c = rot(RIGS[rig].calibration(segment)).as_matrix()
+        assert np.linalg.det(c) == pytest.approx(1.0)
+        forward, left, up = (mocap._axis(a) for a in RIGS[rig].axes[segment])
+        np.testing.assert_allclose(np.cross(forward, left), up, atol=1e-9)  # right-handed table
+        p = np.radians(RIGS[rig].pitch.get(segment, 0.0))
+        np.testing.assert_allclose(c.T @ forward, [np.cos(p), 0, -np.sin(p)], atol=1e-9)  # points down by the pitch
+        np.testing.assert_allclose(c.T @ left, [0, 1, 0], atol=1e-9)
+
+
+def walking_human(source, mocap_dir):
+    """A person walking ahead: the built-in one, or a recording's walking frames."""
+    if source == "builtin":
+        return walk(10.0, variation=0.0)
+    if source == "lafan1":
+        return mocap.load(mocap_dir / "lafan1")[0]
+    return mocap.load(mocap_dir / "bandai", clips="*walk_normal_001")[0]
+
+
+@pytest.mark.parametrize("source", ["builtin", "bandai", "lafan1"])
+def test_anatomy(source, request):
+    """Every source alike: people face where they go, left is left, segments lie along their bones, joints flex."""
+    clip = walking_human(source, None if source == "builtin" else request.getfixturevalue("mocap_dir"))
+    unit = lambda s, axis: rot(clip.quat[:, SEG[s]]).apply(axis)  # noqa: E731
+    velocity = mocap.linear_velocity(clip.pos[:, 0], clip.rate) * [1, 1, 0]
+    moving = np.linalg.norm(velocity, axis=-1) > 0.7
+    assert moving.mean() > 0.5
+    psi = mocap.heading(clip.quat[:, 0])
+    ahead = np.stack([np.cos(psi), np.sin(psi), 0 * psi], -1)
+    left = np.stack([-np.sin(psi), np.cos(psi), 0 * psi], -1)
+    travel = velocity[moving] / np.linalg.norm(velocity[moving], axis=-1, keepdims=True)
+    assert np.sum(travel * ahead[moving], -1).mean() > 0.95
+    for s in ("pelvis", "chest", "head"):
+        assert np.median(np.sum(unit(s, [1, 0, 0]) * ahead, -1)) > 0.9
+        assert np.sum(unit(s, [0, 0, 1]) * [0, 0, 1], -1).mean() > 0.93
+    for s in ("thigh", "shin", "foot", "upper_arm", "hand"):
+        apart = np.sum((clip.pos[:, SEG[s + "_l"]] - clip.pos[:, SEG[s + "_r"]]) * left, -1)
+        assert apart.mean() > 0.05, s
+    for side in "lr":
+        for a, b in (("thigh", "shin"), ("shin", "foot"), ("upper_arm", "forearm"), ("forearm", "hand")):
+            bone = clip.pos[:, SEG[f"{b}_{side}"]] - clip.pos[:, SEG[f"{a}_{side}"]]
+            bone /= np.linalg.norm(bone, axis=-1, keepdims=True)
+            assert np.sum(-unit(f"{a}_{side}", [0, 0, 1]) * bone, -1).min() > np.cos(np.radians(10)), (a, side)
+        turn = lambda a, b: (  # flexion in degrees about the left axis  # noqa: E731
+            np.degrees((rot(clip.quat[:, SEG[f"{a}_{side}"]]).inv() * rot(clip.quat[:, SEG[f"{b}_{side}"]])).as_rotvec())  # noqa: B023
+        )
+        knee, elbow = turn("thigh", "shin"), turn("upper_arm", "forearm")
+        assert -10 < knee[:, 1].min() and 40 < knee[:, 1].max() < 140 and 10 < knee[:, 1].mean() < 60
+        assert np.abs(knee[:, [0, 2]]).max() < 25
+        assert elbow[:, 1].mean() < -3 and elbow[:, 1].max() < 20
+        foot, ball = SEG[f"foot_{side}"], clip.ball[:, "lr".index(side)]
+        along = rot(clip.quat[:, foot]).inv().apply(ball - clip.pos[:, foot])
+        assert (along[:, 0] > 0.05).all() and (np.abs(along[:, 1]) < 0.06).all()
+        low = (np.abs(ball[:, 2] - np.percentile(ball[:, 2], 10)) < 0.01) & (
+            clip.pos[:, foot, 2] < np.percentile(clip.pos[:, foot, 2], 25)
+        )  # heel and ball both down: the sole is flat
+        assert abs(90 - np.median(angle(unit(f"foot_{side}", [1, 0, 0])[low], [0, 0, 1]))) < 8
+    assert 0.7 < clip.hip_height < 1.1
+    assert 0.35 < mocap.contacts(clip).mean() < 0.75
+
+
+@pytest.mark.parametrize("name", ["bandai/dataset-2_walk-turn-left_active_001", "lafan1/Lafan1_example"])
+def test_bvh_against_scipy(mocap_dir, name):
+    """Recorded files: SciPy's rotations down the chain, then centimetres and y up made metres and z up by a matrix."""
+    b = bvh.read(mocap_dir / f"{name}.bvh")
+    clip = mocap.from_bvh(mocap_dir / f"{name}.bvh")
+    rig = RIGS[name.split("/")[0]]
+    assert len(clip) == len(b.values) and clip.rate == pytest.approx(30.0, rel=1e-4)
+    for t in (0, len(clip) // 2, len(clip) - 1):
+        row, position, rotation = iter(b.values[t]), {}, {}
+        for j, joint in enumerate(b.names):
+            x, r = b.offsets[j].copy(), np.eye(3)
+            for channel in b.channels[j]:
+                value, axis = next(row), channel[0]
+                if channel.endswith("rotation"):
+                    r = r @ Rotation.from_euler(axis, value, degrees=True).as_matrix()
+                else:  # this LaFAN1 file's root lies relative to its OFFSET; everywhere else channels replace it
+                    add = b.offsets[j]["XYZ".index(axis)] if "lafan1" in name else 0.0
+                    x["XYZ".index(axis)] = value + add
+            if j:
+                up = b.names[b.parents[j]]
+                x, r = position[up] + rotation[up] @ x, rotation[up] @ r
+            position[joint], rotation[joint] = x, r
+        metres = {k: TO_FILE.T @ v / 100 for k, v in position.items()}
+        for i, segment in enumerate(SEGMENTS):
+            j = rig.joints[segment]
+            want = metres[j]
+            if segment == "pelvis":
+                want = (metres[rig.joints["thigh_l"]] + metres[rig.joints["thigh_r"]]) / 2
+            np.testing.assert_allclose(clip.pos[t, i], want, atol=1e-9)
+            axes = [TO_FILE.T @ rotation[j] @ mocap._axis(a) for a in rig.axes[segment]]
+            p = np.radians(rig.pitch.get(segment, 0.0))
+            forward = np.cos(p) * axes[0] + np.sin(p) * axes[2]  # the joint's forward axis, lifted by the pitch
+            got = rot(clip.quat[t, i]).as_matrix()
+            np.testing.assert_allclose(got[:, 0], forward, atol=1e-9)
+            np.testing.assert_allclose(got[:, 1], axes[1], atol=1e-9)
+        np.testing.assert_allclose(clip.ball[t], [metres[n] for n in rig.balls], atol=1e-9)
+    assert 0 < np.percentile(clip.ball[..., 2].min(1), 20) < 0.06  # the feet are on the floor
+
+
+@pytest.mark.parametrize("kind", ["absolute", "relative"])
+def test_root_offset(tmp_path, kind):
+    """The root's OFFSET is added or not, whichever puts the feet on the floor."""
+    clip = walk(2.0)
+    assert_same(mocap.from_bvh(write_as(tmp_path / "a.bvh", "lafan1", clip, root_offset=kind)), clip)
+
+
+def test_unknown_rig(tmp_path):
+    path = write_as(tmp_path / "odd.bvh", "lafan1", still(2), rename={"LeftToe": "LeftBigToe"})
+    with pytest.raises(UserError) as e:
+        mocap.from_bvh(path)
+    for word in ("odd.bvh", "LeftBigToe", "Hips", *RIGS):
+        assert word in str(e.value)
+    for name in RIGS:
+        assert mocap.rig_of(bvh.read(write_as(tmp_path / "ok.bvh", name, still(2)))) == name
+
+
+def test_bandai_loads_in_seconds(mocap_dir):
+    """A quarter of the 716 clips, so that the suite stays short."""
+    start = time.process_time()
+    clips = mocap.load(mocap_dir / "bandai", clips="*_00?")
+    seconds = time.process_time() - start
+    print(f"{len(clips)} clips in {seconds:.1f} s: 716 in {716 * seconds / len(clips):.1f} s")
+    assert len(clips) == 180 and seconds < 20
+    assert len({c.body for c in clips}) == 1 and {c.rate for c in clips} == {30.0}
+
+
+# ---------------------------------------------------------------- rate, place, sensors, contacts
+
+
+@pytest.mark.parametrize("rate, new", [(30, 120), (120, 30), (60, 30), (100, 30), (30, 36), (24, 30)])
+def test_resample(rate, new):
+    clip = walk(2.0, float(rate))
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], clip.quat.shape[:2] + (1,))
+    mixed = replace(clip, quat=clip.quat * signs)  # the shorter arc, whatever the signs
+    got = mocap.resample(mixed, new)
+    old, t = np.arange(len(clip)) / rate, np.arange(len(got)) / new
+    assert got.rate == new and t[-1] <= old[-1] + 1e-9 < t[-1] + 1 / new + 1e-6
+    t = np.minimum(t, old[-1])
+    for j in (0, SEG["foot_l"], SEG["hand_r"]):
+        want = np.stack([np.interp(t, old, clip.pos[:, j, k]) for k in range(3)], -1)
+        np.testing.assert_allclose(got.pos[:, j], want, atol=1e-9)
+        want = Slerp(old, rot(clip.quat[:, j]))(t)
+        assert (rot(got.quat[:, j]) * want.inv()).magnitude().max() < 1e-7
+    np.testing.assert_allclose(got.ball[:, 1, 2], np.interp(t, old, clip.ball[:, 1, 2]), atol=1e-9)
+    assert (np.sum(got.quat[1:] * got.quat[:-1], -1) > 0).all()  # continuous signs
+    np.testing.assert_allclose(np.linalg.norm(got.quat, axis=-1), 1, atol=1e-12)
+    if rate == 60:
+        np.testing.assert_allclose(got.pos, clip.pos[::2], atol=1e-12)
+    assert mocap.resample(clip, rate).pos is clip.pos
+
+
+def test_slerp_ends():
+    a, b = some_quats(50, 1), some_quats(50, 2)
+    for q in (b, -b):
+        assert mocap.quat_angle(mocap.quat_slerp(a, q, np.zeros(50)), a).max() < 1e-7
+        assert mocap.quat_angle(mocap.quat_slerp(a, q, np.ones(50)), b).max() < 1e-7
+        half = mocap.quat_slerp(a, q, np.full(50, 0.5))
+        np.testing.assert_allclose(mocap.quat_angle(half, a), mocap.quat_angle(a, b) / 2, atol=1e-7)
+    same = mocap.quat_slerp(a, -a * (1 + 1e-16), np.full(50, 0.3))
+    assert np.isfinite(same).all() and mocap.quat_angle(same, a).max() < 1e-7
+
+
+def test_place():
+    clip = walk(1.0)
+    yaw, pivot, to = 2.5, clip.pos[10, 0, :2], np.array([3.0, -4.0])
+    got = mocap.place(clip, yaw, pivot, to)
+    r = Rotation.from_euler("z", yaw)
+    np.testing.assert_allclose(got.pos[10, 0, :2], to, atol=1e-12)
+    np.testing.assert_allclose(got.pos[..., 2], clip.pos[..., 2], atol=1e-12)
+    want = r.apply(clip.pos[5] - [*pivot, 0]) + [*to, 0]
+    np.testing.assert_allclose(got.pos[5], want, atol=1e-12)
+    np.testing.assert_allclose(got.ball[5], r.apply(clip.ball[5] - [*pivot, 0]) + [*to, 0], atol=1e-12)
+    np.testing.assert_allclose(rot(got.quat[5]).as_matrix(), (r * rot(clip.quat[5])).as_matrix(), atol=1e-12)
+    turned = mocap.heading(got.quat[:, 0]) - mocap.heading(clip.quat[:, 0]) - yaw
+    np.testing.assert_allclose((turned + np.pi) % (2 * np.pi) - np.pi, 0, atol=1e-9)
+
+
+def test_sensors():
+    clip = walk(2.0)
+    pos, quat = mocap.sensors(clip)
+    for row, (segment, offset) in enumerate(
+        [("head", [0.11, 0, 0.08]), ("hand_l", [0.02, 0, -0.09]), ("hand_r", [0.02, 0, -0.09])]
+    ):
+        want = clip.pos[:, SEG[segment]] + rot(clip.quat[:, SEG[segment]]).apply(offset)
+        np.testing.assert_allclose(pos[:, row], want, atol=1e-12)
+        np.testing.assert_array_equal(quat[:, row], clip.quat[:, SEG[segment]])
+    # by hand: facing left (+y), the eyes lie 11 cm to the left of the neck; hanging hands hold 9 cm below the wrists
+    left = mocap.place(still(2), np.pi / 2, np.zeros(2), np.zeros(2))
+    pos, _ = mocap.sensors(left)
+    np.testing.assert_allclose(pos[0, 0] - left.pos[0, SEG["head"]], [0, 0.11, 0.08], atol=1e-12)
+    np.testing.assert_allclose(pos[0, 1] - left.pos[0, SEG["hand_l"]], [0, 0.02, -0.09], atol=1e-12)
+
+
+def test_contacts():
+    def feet(ankle_z, ankle_v, ball_z, ball_v):
+        """Left foot as asked, right foot a metre up."""
+        clip, t = still(9), np.arange(9)[:, None] / 30.0
+        pos, ball = clip.pos.copy(), clip.ball.copy()
+        pos[:, FEET[0]] = [0, 0, ankle_z] + t * ankle_v
+        ball[:, 0] = [0.1, 0, ball_z] + t * ball_v
+        pos[:, FEET[1]] = ball[:, 1] = [0, 0, 1.0]
+        c = mocap.contacts(replace(clip, pos=pos, ball=ball))
+        assert c.dtype == bool and c.shape == (9, 2) and not c[:, 1].any() and (c[:, 0] == c[0, 0]).all()
+        return c[0, 0]
+
+    x, fast = np.array([1.0, 0, 0]), np.array([2.0, 0, 0])
+    assert feet(0.19, 0 * x, 0.5, fast) and not feet(0.21, 0 * x, 0.5, fast)  # 0.20 m
+    assert feet(0.1, 0.39 * x, 0.5, fast) and not feet(0.1, 0.41 * x, 0.5, fast)  # 0.4 m/s
+    assert not feet(0.05, 0.3 * np.array([1, 1, 0.2]), 0.5, fast)  # 0.43 m/s: all three axes count
+    assert feet(0.5, fast, 0.02, 0 * x)  # heel up, ball down: toe-off is still contact
+    assert feet(0.1, 0 * x, 0.3, fast)  # heel down, ball up: so is heel strike
+    assert not feet(0.5, 0 * x, 0.02, fast) and not feet(0.1, fast, 0.3, 0 * x)  # each point by itself
+
+    clip = walk(3.0)
+    want = np.zeros((len(clip), 2), bool)
+    for i in range(len(clip)):
+        a, b = max(i - 1, 0), min(i + 1, len(clip) - 1)
+        for side, foot in enumerate(("foot_l", "foot_r")):
+            for p in (clip.pos[:, SEG[foot]], clip.ball[:, side]):
+                speed = np.linalg.norm(p[b] - p[a]) / ((b - a) / clip.rate)
+                want[i, side] |= p[i, 2] < 0.20 and speed < 0.4
+    np.testing.assert_array_equal(mocap.contacts(clip), want)
+    assert 0.5 < want.mean() < 0.75  # a walk: each foot is down about 62 % of the time
+    # labels belong to the human: half the size would move half as fast and be down more often
+    small = replace(clip, pos=0.5 * clip.pos, ball=0.5 * clip.ball)
+    assert mocap.contacts(small).mean() > want.mean() + 0.02
+
+
+# ---------------------------------------------------------------- stitching
+
+
+def pieces(seed=0, n=12, body="a"):
+    """Short clips of one person: cuts of 3 to 7 s out of three walks."""
+    rng, out = np.random.default_rng(seed), []
+    for k, speed in enumerate((1.0, 1.2, 1.35)):
+        long, at = walk(40.0, seed=seed + k, speed=speed), 0
+        for i in range(n // 3):
+            length = int(rng.uniform(90, 210))
+            out.append(replace(long[at : at + length], name=f"cut_{k}{i:02d}", body=body))
+            at += length
+    return out
+
+
+@pytest.fixture
+def parts_of(monkeypatch):
+    """What stitch joins: a list of (clip, first frame, last frame) for each sequence, filled as it runs."""
+    seen, join = [], mocap._join
+
+    def spy(parts, blend, name):
+        seen.append(parts)
+        return join(parts, blend, name)
+
+    monkeypatch.setattr(mocap, "_join", spy)
+    return seen
+
+
+def slow_feature(clip, t):
+    """(8, 6): position on the floor below the root and 0.1 s of velocity, turned into the heading frame by SciPy."""
+    a, b = max(t - 1, 0), min(t + 1, len(clip) - 1)
+    left = rot(clip.quat[t, 0]).apply([0, 1, 0])
+    back = Rotation.from_euler("z", -np.arctan2(-left[0], left[1]))
+    rows = []
+    for s in ("chest", "head", "shin_l", "foot_l", "shin_r", "foot_r", "hand_l", "hand_r"):
+        p = clip.pos[:, SEG[s]]
+        v = (p[b] - p[a]) * clip.rate / (b - a)
+        root = clip.pos[t, 0] * [1, 1, 0]
+        rows.append(np.concatenate([back.apply(p[t] - root), 0.1 * back.apply(v)]))
+    return np.array(rows)
+
+
+def slow_distance(a, i, b, j):
+    d = slow_feature(a, i) - slow_feature(b, j)
+    return np.sqrt(np.mean(np.sum(d**2, axis=1)))
+
+
+def test_stitch_distance():
+    a, b = walk(2.0, speed=1.1), walk(2.0, seed=4, speed=1.4, turn_rate=0.5)
+    fa, fb = mocap.motion_features(a), mocap.motion_features(b)
+    for i, j in ((0, 0), (10, 30), (59, 59), (25, 7)):
+        assert np.linalg.norm(fa[i] - fb[j]) == pytest.approx(slow_distance(a, i, b, j), abs=1e-6)
+    # where on the plane and which way it faces do not matter
+    moved = mocap.motion_features(mocap.place(a, 2.0, np.array([1.0, 2]), np.array([-5.0, 7])))
+    np.testing.assert_allclose(moved, fa, atol=1e-5)
+    # by hand: one of the eight joints 8 cm higher is sqrt(0.08²/8); a body going 1 m/s faster is 10 cm off
+    rest = still(3)
+    pos = rest.pos.copy()
+    pos[:, SEG["hand_l"], 2] += 0.08
+    f = mocap.motion_features(rest)
+    lifted = mocap.motion_features(replace(rest, pos=pos))
+    assert np.linalg.norm(lifted[1] - f[1]) == pytest.approx(0.08 / np.sqrt(8), abs=1e-6)
+    drift = replace(rest, pos=rest.pos + np.arange(3)[:, None, None] / rest.rate * [1.0, 0, 0])
+    assert np.linalg.norm(mocap.motion_features(drift)[1] - f[1]) == pytest.approx(0.1, abs=1e-6)
+
+
+def test_stitch(parts_of):
+    clips = pieces()
+    copies = [c.pos.copy() for c in clips]
+    out, report = mocap.stitch(clips, np.random.default_rng(0))
+    first, parts = [(c.name, c.pos.tobytes(), c.quat.tobytes(), c.ball.tobytes()) for c in out], list(parts_of)
+    assert all(np.array_equal(c.pos, p) for c, p in zip(clips, copies))
+    assert len(out) >= 2 and all(c.seconds >= 30 for c in out) and {c.rate for c in out} == {30.0}
+
+    # the same seed gives the same bytes, another seed other ones
+    again, _ = mocap.stitch(clips, np.random.default_rng(0))
+    assert [(c.name, c.pos.tobytes(), c.quat.tobytes(), c.ball.tobytes()) for c in again] == first
+    other, _ = mocap.stitch(clips, np.random.default_rng(1))
+    assert [c.pos.tobytes() for c in other] != [f[1] for f in first]
+
+    # the report, counted another way
+    used, distances = {c.name: set() for c in clips}, []
+    for joined in parts:
+        for clip, a, b in joined:
+            used[clip.name] |= set(range(a, b + 1))
+            assert b - a >= 30 or clip is joined[-1][0]  # at least a second of each
+        distances += [slow_distance(x[0], x[2], y[0], y[1]) for x, y in zip(joined, joined[1:])]
+    assert report.sequences == len(out) and report.seconds == pytest.approx(sum(len(c) for c in out) / 30)
+    assert report.joins == len(distances) > 0 and report.frames == sum(map(len, clips))
+    np.testing.assert_allclose(report.distances, distances, atol=1e-3)
+    assert max(distances) <= 0.15 and report.frames_used == sum(map(len, used.values())) > 0.7 * report.frames
+    assert report.lost == [n for n, frames in used.items() if not frames]
+    assert f"{report.joins} joins" in str(report) and "limit 15" in str(report)
+
+    # only joins below the limit: a tighter one makes fewer and says what is lost
+    tight, told = mocap.stitch(clips, np.random.default_rng(0), limit=0.03)
+    assert all(d <= 0.03 for d in told.distances) and told.joins < report.joins
+    none, told = mocap.stitch(clips, np.random.default_rng(0), limit=1e-6)
+    assert none == [] and told.lost == [c.name for c in clips] and f"lost {len(clips)} clips" in str(told)
+
+
+def check_joins(clips, out, parts):
+    """Frame by frame with SciPy: rigid copies of the source, turned about the vertical, ten blended frames a join."""
+    for sequence, joined in zip(out, parts, strict=True):
+        clip, a, b = joined[0]
+        turn, shift = Rotation.identity(), np.zeros(3)
+        want, wanted = [clip.pos[t] for t in range(a, b)], [rot(clip.quat[t]) for t in range(a, b)]
+        blended = 0
+        for new, na, nb in joined[1:]:
+            place_old = lambda t, c=clip, r=turn, s=shift: (r.apply(c.pos[t]) + s, r * rot(c.quat[t]))  # noqa: E731
+            left = place_old(b)[1][0].apply([0, 1, 0])
+            new_left = rot(new.quat[na, 0]).apply([0, 1, 0])
+            turn = Rotation.from_euler("z", np.arctan2(-left[0], left[1]) - np.arctan2(-new_left[0], new_left[1]))
+            shift = (place_old(b)[0][0] - turn.apply(new.pos[na, 0])) * [1, 1, 0]
+            place_new = lambda t, c=new, r=turn, s=shift: (r.apply(c.pos[t]) + s, r * rot(c.quat[t]))  # noqa: E731
+            np.testing.assert_allclose(place_new(na)[0][0, :2], place_old(b)[0][0, :2], atol=1e-9)
+            for k in range(10):
+                x = (k + 1) / 11
+                w = 3 * x**2 - 2 * x**3
+                (p, r), (p_new, r_new) = place_old(b + k), place_new(na + k)
+                want.append((1 - w) * p + w * p_new)
+                wanted.append(Rotation.from_rotvec(w * (r_new * r.inv()).as_rotvec()) * r)
+                blended += 1
+            for t in range(na + 10, nb):
+                p, r = place_new(t)
+                want.append(p), wanted.append(r)
+            clip, b = new, nb
+        want.append(turn.apply(clip.pos[b]) + shift), wanted.append(turn * rot(clip.quat[b]))
+        assert blended == 10 * (len(joined) - 1)
+        np.testing.assert_allclose(sequence.pos, want, atol=1e-8)
+        off = [(rot(q) * r.inv()).magnitude().max() for q, r in zip(sequence.quat, wanted)]
+        assert max(off) < 1e-6
+        assert (np.sum(sequence.quat[1:] * sequence.quat[:-1], -1) > 0).all()
+
+    # across joins nothing jumps more than it does in the clips themselves
+    step = lambda c: np.linalg.norm(np.diff(c.pos, axis=0), axis=-1).max()  # noqa: E731
+    twist = lambda c: mocap.quat_angle(c.quat[1:], c.quat[:-1]).max()  # noqa: E731
+    jerk = lambda c: np.linalg.norm(np.diff(c.pos[:, 0], n=2, axis=0), axis=-1).max() * c.rate  # noqa: E731
+    assert max(map(step, out)) < 1.2 * max(map(step, clips))
+    assert max(map(twist, out)) < 1.2 * max(map(twist, clips)) + np.radians(2)
+    assert max(map(jerk, out)) < max(map(jerk, clips)) + 0.15  # m/s from frame to frame
+
+
+def test_stitch_joins(parts_of):
+    clips = pieces()
+    out, _ = mocap.stitch(clips, np.random.default_rng(0))
+    check_joins(clips, out, parts_of)
+
+
+def test_stitch_recorded(mocap_dir, parts_of):
+    clips = mocap.load(mocap_dir / "bandai", clips="*_normal_00?", split="train")
+    out, report = mocap.stitch(clips, np.random.default_rng(0))
+    print(report)
+    assert len(out) > 5 and all(c.seconds >= 30 for c in out) and report.frames_used > 0.6 * report.frames
+    check_joins(clips, out[:4], parts_of[:4])
+
+
+def test_stitch_bodies(parts_of):
+    """Clips of different bodies are never joined; what is too few to join is lost, and named; long clips pass."""
+    a, b = pieces(), [replace(c, name=f"b_{c.name}", body="b") for c in pieces(seed=7)]
+    lone = replace(a[0], name="lone", body="c")
+    long = walk(31.0, name="long", body="d")
+    out, report = mocap.stitch([*a, *b, lone, long], np.random.default_rng(0))
+    assert all(len({clip.body for clip, _, _ in joined}) == 1 for joined in parts_of)
+    assert [c.body for c in out] == ["d"] + [joined[0][0].body for joined in parts_of]
+    assert {"a", "b", "d"} == {c.body for c in out}
+    assert out[0] is long and "lone" in report.lost
+    assert f"lost {len(report.lost)} clips" in str(report)
+    only, report = mocap.stitch([long], np.random.default_rng(0))
+    assert only == [long] and report.frames_used == len(long) and "no joins needed" in str(report)
+    nothing, report = mocap.stitch([lone], np.random.default_rng(0))
+    assert nothing == [] and report.lost == ["lone"] and "lost 1 clips (lone)" in str(report)
+    with pytest.raises(ValueError, match="30, 60 Hz"):
+        mocap.stitch([lone, replace(lone, rate=60.0)], np.random.default_rng(0))
+
+
+def test_two_people_in_one_rig_are_two_bodies(tmp_path):
+    for height in (1.6, 1.75):
+        write_as(tmp_path / f"h{100 * height:.0f}.bvh", "lafan1", walk(1.0, height=height))
+    assert len({c.body for c in mocap.load(tmp_path)}) == 2
+
+
+def test_sequences(tmp_path, capsys):
+    for split in ("train", "validation"):
+        out = mocap.sequences("builtin", split)
+        assert all(c.seconds >= 30 for c in out)
+        line = capsys.readouterr().out
+        assert f"builtin [{split}]" in line and "lost" not in line and line.count("\n") == 1
+    # too little to join anything: single clips, and it says so
+    write_as(tmp_path / "short_001.bvh", "bandai", walk(2.0))
+    out = mocap.sequences(tmp_path, "train")
+    assert [c.name for c in out] == ["short_001"] and "single clips are used" in capsys.readouterr().out
+    mocap.sequences(tmp_path, "train", verbose=False)
+    assert capsys.readouterr().out == ""
+
+
+# ---------------------------------------------------------------- data sets
+
+
+def test_split(tmp_path):
+    for name, part in {
+        "dataset-2_walk_normal_005": "validation", "dataset-2_walk_normal_015": "validation",
+        "dataset-2_walk_normal_050": "train", "dataset-2_walk_normal_051": "train",
+        "dataset-2_walk_youthful_005": "style", "dataset-2_run_youthful_001": "style",
+        "walk1_subject5": "validation", "walk1_subject1": "train", "walk": "train", "5_walk": "train",
+    }.items():  # fmt: skip
+        assert mocap.split_of(name) == part, name
+
+    clip = still(2)
+    for i in range(1, 7):
+        write_as(tmp_path / f"walk_{i:03d}.bvh", "bandai", clip)
+    load = lambda split, **kw: [c.name[-1] for c in mocap.load(tmp_path, split=split, **kw)]  # noqa: E731
+    assert load("train") == list("12346") and load("validation") == ["5"] and load("all") == list("123456")
+    assert load("all", clips="*_00[12]") == ["1", "2"]
+    names = {s: {c.name for c in mocap.load("builtin", split=s)} for s in ("train", "validation", "all")}
+    assert names["train"] | names["validation"] == names["all"] and not names["train"] & names["validation"]
+    assert names["validation"] == {n for n in names["all"] if n.endswith("5")}
+
+
+def test_small_sets_are_used_whole(tmp_path, capsys):
+    write_as(tmp_path / "walk_001.bvh", "bandai", still(2))
+    assert [c.name for c in mocap.load(tmp_path, split="validation")] == ["walk_001"]
+    assert "none to hold out" in capsys.readouterr().err
+    for i in range(2, 12):  # with ten clips one has to be held out
+        (tmp_path / f"walk_{10 * i}.bvh").write_text((tmp_path / "walk_001.bvh").read_text())
+    with pytest.raises(UserError, match="none of the 11 clips that match '\\*' is in split 'validation'.*in train"):
+        mocap.load(tmp_path, split="validation")
+
+
+def test_load_errors(tmp_path):
+    def message(*args, **kw):
+        with pytest.raises(UserError) as e:
+            mocap.load(*args, **kw)
+        assert "\n" not in str(e.value)
+        return str(e.value)
+
+    assert "no such file or folder" in (m := message(tmp_path / "nowhere")) and "builtin" in m and "nowhere" in m
+    assert "holds no .bvh file" in message(tmp_path)
+    assert all(s in message("builtin", split="test") for s in ("'test'", *mocap.SPLITS))
+    assert "'*fly*'" in (m := message("builtin", clips="*fly*")) and "00_walk" in m and "(20)" in m
+    m = message("builtin", clips="*walk*", split="validation")
+    assert "'*walk*'" in m and "'validation'" in m and "train" in m
+    write_as(tmp_path / "walk_001.bvh", "bandai", still(2))
+    (tmp_path / "UPPER.BVH").write_text((tmp_path / "walk_001.bvh").read_text())  # other systems' spelling
+    assert [c.name for c in mocap.load(tmp_path)] == ["UPPER", "walk_001"]
+    m = message(tmp_path, clips="run*")
+    assert "'run*'" in m and "walk_001" in m and "…" not in m
+    text = (tmp_path / "walk_001.bvh").read_text().splitlines()
+    (tmp_path / "broken_002.bvh").write_text("\n".join([*text[:-1], text[-1].replace("0.", "nan ", 1)]))
+    assert "broken_002.bvh" in message(tmp_path)
+    with pytest.raises(UserError, match="gone.bvh.*expected a .bvh file"):
+        mocap.from_bvh(tmp_path / "gone.bvh")
+
+
+def test_builtin():
+    """Ten minutes, the same bytes for a seed, and feet that neither skate nor sink by our own contact labels."""
+    a, b, c = mocap.builtin_clips(), mocap.builtin_clips(), mocap.builtin_clips(seed=1)
+    for x, y in zip(a, b, strict=True):
+        assert x.name == y.name and all(
+            getattr(x, k).tobytes() == getattr(y, k).tobytes() for k in ("pos", "quat", "ball")
+        )
+    assert a[0].pos.tobytes() != c[0].pos.tobytes()
+    assert sum(x.seconds for x in a) == pytest.approx(600, abs=0.1)
+    assert len({x.body for x in a}) == len({x.name for x in a}) == len(a)
+    kinds = {x.name.split("_")[1] for x in a}
+    assert kinds == set(gait.KINDS)
+    for x in a:
+        body = gait.body_of({"pos": x.pos})
+        down, lowest = mocap.contacts(x), []
+        slide = []
+        for side, foot in enumerate(FEET):
+            heel = x.pos[:, foot] + rot(x.quat[:, foot]).apply(body.heel)
+            sole = x.ball[:, side] - [0, 0, body.ball_height]
+            lowest += [heel[:, 2].min(), sole[:, 2].min()]
+            pair = np.stack([heel, sole])
+            speed = np.linalg.norm(np.gradient(pair[..., :2], 1 / x.rate, axis=1), axis=-1)
+            under = np.argmin(pair[..., 2], axis=0)
+            slide.append(speed[under, np.arange(len(x))][down[:, side]])
+        assert np.concatenate(slide).mean() < 0.05, x.name
+        assert min(lowest) > -0.02, x.name
+
+
+# ---------------------------------------------------------------- inspect, and short clips
+
+
+def test_inspect(tmp_path, capsys):
+    clip = walk(3.0, 60.0, name="walk_001")
+    path = write_as(tmp_path / "walk_001.bvh", "lafan1", clip)
+    mocap.main(["inspect", str(path)])
+    out = capsys.readouterr().out
+    for word in ("rig lafan1", "17 joints", "LeftUpLeg", "thigh_l", "60.0 Hz", "180 frames", "3.0 s", "footfalls"):
+        assert word in out, word
+    travel = sum(np.hypot(*(b - a)) for a, b in zip(clip.pos[:, 0, :2], clip.pos[1:, 0, :2]))
+    assert f"{travel:6.2f} m" in out and f"{travel / (179 / 60):4.2f} m/s" in out
+    assert f"contact L {100 * mocap.contacts(clip)[:, 0].mean():3.0f} %" in out
+    mocap.main(["inspect", str(tmp_path)])
+    out = capsys.readouterr().out
+    assert "walk_001" in out and " 30.0 Hz" in out and "single clips are used" in out
+    with pytest.raises(UserError, match="nowhere"):
+        mocap.main(["inspect", str(tmp_path / "nowhere")])
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_one_and_two_frames(tmp_path, frames, capsys):
+    path = write_as(tmp_path / "short.bvh", "bandai", still(frames, 60.0))
+    clip = mocap.from_bvh(path)
+    assert len(clip) == frames
+    assert len(mocap.resample(clip, 30.0)) == 1 and len(mocap.resample(clip, 120.0)) == 2 * frames - 1
+    assert mocap.contacts(clip).all() and mocap.sensors(clip)[0].shape == (frames, 3, 3)
+    assert np.isfinite(mocap.motion_features(clip)).all() and np.isfinite(clip.hip_height)
+    assert not np.any(mocap.angular_velocity(clip.quat, clip.rate))
+    assert mocap.stitch([clip], np.random.default_rng(0))[1].lost == ["short"]
+    mocap.main(["inspect", str(path)])
+    assert f"{frames} frames" in capsys.readouterr().out
+    assert len(mocap.sequences(tmp_path)) == 1
