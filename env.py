@@ -13,12 +13,14 @@ After a physics step MuJoCo's positions, velocities and contacts still belong to
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 
 from mocap import heading, quat_angle
 from retarget import STAGE_VEL, TERMS, Character, Reference, body_velocity, geom_lowest
-from runs import rng_from_state, rng_state
+from runs import UserError, rng_from_state, rng_state
 
 ROOT_LIMIT = 0.30  # m  [Reda23 §3.6]; ASSUMED in 3-D
 FORCE_LIMIT = 1.0  # N  [Reda23 App. A]
@@ -212,6 +214,22 @@ def too_far(root_pos, root_target):
 # ------------------------------------------------------------------------------------ environment
 
 
+@dataclass(frozen=True)
+class Disturbance:
+    """What training adds so that a policy survives other users and devices; all zero (the paper) by default.
+
+    sensor_offset : standard deviation of a constant error of each device's position in an episode [m]
+    sensor_noise  : of white noise on it [m]
+    push          : largest change of the root's horizontal velocity in a push [m/s]
+    push_seconds  : mean time between pushes [s]
+    """
+
+    sensor_offset: float = 0.0
+    sensor_noise: float = 0.0
+    push: float = 0.0
+    push_seconds: float = 2.0
+
+
 class Env:
     """N characters following random places of a reference  [Reda23 §3.6].
 
@@ -237,8 +255,10 @@ class Env:
         horizon=EPISODE_STEPS,
         substeps=SUBSTEPS,
         autoreset=True,
+        disturbance=Disturbance(),  # noqa: B008, it is frozen
     ):
         self.char, self.ref, self.n, self.horizon, self.substeps = char, ref, n, horizon, substeps
+        self.disturbance = disturbance
         self.dt = 1.0 / ref.rate
         self.autoreset = autoreset
         char.model.opt.timestep = self.dt / substeps
@@ -264,9 +284,12 @@ class Env:
         self.available = np.ones(n, int)  # control steps from the start to the clip's end or the horizon
         self.action = np.zeros((n, self.action_size))
         self.contact = np.zeros((n, 2), bool)
+        self.sensor_error = np.zeros((n, 3, 9))  # of each device: constant, previous frame's, this frame's
         self.rng = np.random.default_rng(seed)
         # a start needs a frame before it (o_{t-1,user}) and one after it
         self.starts = np.concatenate([np.arange(a + 1, b) for a, b in zip(ref.first, ref.last, strict=True)])
+        if not len(self.starts):
+            raise UserError(f"{', '.join(ref.names[:3])}: too short; a start needs a sequence of three frames or more")
         self.owner = np.repeat(np.arange(len(ref.first)), ref.last - ref.first + 1)
 
     # ---- reset
@@ -296,6 +319,8 @@ class Env:
         self.frame[ids], self.sequence[ids], self.steps[ids] = f, self.owner[f], 0
         self.available[ids] = np.minimum(self.horizon, self.ref.last[self.owner[f]] - f)
         self.qpos[ids], self.qvel[ids] = self.ref.qpos[f], self.ref.qvel[f]
+        if self.disturbance.sensor_offset:
+            self.sensor_error[ids, 0] = self.disturbance.sensor_offset * self.rng.standard_normal((len(ids), 9))
         self.action[ids], self.ctrl[ids], self.warmstart[ids] = 0.0, 0.0, 0.0
         self.batch.forward(ids, STAGE_VEL)
 
@@ -319,13 +344,14 @@ class Env:
         if not np.isfinite(action).all():
             raise ValueError(f"action of environment {int(np.argmin(np.isfinite(action).all(1)))} is not finite")
         a = np.clip(action, -1.0, 1.0)  # only the physics sees clipped actions (design.md, mistake 3)
+        self._disturb()
         self.ctrl[:] = a
         self.batch.step(nstep=self.substeps, stage=STAGE_VEL)
         self.frame = np.minimum(self.frame + 1, self.ref.last[self.sequence])  # without autoreset the last frame stays
         self.steps += 1
         bad = self._recover()
         f = self.frame
-        self.contact = self._contact()
+        self.contact = self._contact() & ~bad[:, None]
         terms = self.reward_terms(a)
         if bad.any():
             terms = {name: np.where(bad, 0.0, value) for name, value in terms.items()}
@@ -354,6 +380,18 @@ class Env:
         info["critic"] = self.full
         return self.full[:, : self.obs_size], reward, terminated, truncated, info
 
+    def _disturb(self):
+        """Pushes, and the next frame's sensor noise.  Test: tests/test_env.py::test_disturbance"""
+        d = self.disturbance
+        if d.push:
+            pushed = np.flatnonzero(self.rng.random(self.n) < self.dt / d.push_seconds)
+            angle, size = self.rng.uniform(0, 2 * np.pi, len(pushed)), self.rng.uniform(0, d.push, len(pushed))
+            self.qvel[pushed, 0] += size * np.cos(angle)
+            self.qvel[pushed, 1] += size * np.sin(angle)
+        if d.sensor_noise:
+            self.sensor_error[:, 1] = self.sensor_error[:, 2]
+            self.sensor_error[:, 2] = d.sensor_noise * self.rng.standard_normal((self.n, 9))
+
     def _recover(self):
         """Environments whose state is not finite, or that MuJoCo had to reset: put back on the reference, ended as
         failures, so that nothing non-finite reaches the networks (design.md, mistake 11).  -> (N,) bool
@@ -371,6 +409,9 @@ class Env:
 
     def _contact(self):
         """Feet whose normal force on the floor exceeds 1 N during the last substep.  (N, 2) bool
+
+        To be called after a step: `forward` (a reset) computes no forces, and leaves in sensordata whatever simulation
+        the thread ran before.
 
         Test      tests/test_env.py::test_contact_forces"""
         return np.abs(self.sensordata[:, self.char.contact_adr]) > FORCE_LIMIT
@@ -417,6 +458,10 @@ class Env:
         before = np.maximum(f - 1, ref.first[self.sequence[ids]])  # a sequence's first frame has none before it
         observe_user(frame, ref.sensor_pos[before], ref.sensor_rot[before], out[:, s["user_previous"]])
         observe_user(frame, ref.sensor_pos[f], ref.sensor_rot[f], out[:, s["user"]])
+        if self.disturbance.sensor_offset or self.disturbance.sensor_noise:
+            constant, previous, present = np.moveaxis(self.sensor_error[ids], 1, 0)  # in the heading frame
+            out[:, s["user_previous"]][:, :9] += constant + previous
+            out[:, s["user"]][:, :9] += constant + present
         last = ref.last[self.sequence[ids]]
         frame.place(ref.human_pos[f], out[:, s["human_pos"]].reshape(n, 15, 3))
         frame.turn(ref.human_rot[f], out[:, s["human_rot"]].reshape(n, 15, 3, 2))
@@ -432,7 +477,7 @@ class Env:
         """Arrays and JSON that `load_state` continues from bit-exactly.
 
         Test      tests/test_env.py::test_state_continues_exactly, tests/test_ppo.py::test_resume_is_exact"""
-        arrays = {k: getattr(self, k).copy() for k in ("frame", "steps", "available", "action")}
+        arrays = {k: getattr(self, k).copy() for k in ("frame", "steps", "available", "action", "sensor_error")}
         return {"state": self.batch.state.copy()} | arrays, {"rng": rng_state(self.rng)}
 
     def load_state(self, arrays, meta):
@@ -442,6 +487,7 @@ class Env:
         self.batch.state[:] = arrays["state"]
         self.frame[:], self.steps[:], self.action[:] = arrays["frame"], arrays["steps"], arrays["action"]
         self.available[:] = arrays["available"]
+        self.sensor_error[:] = arrays.get("sensor_error", 0.0)  # older checkpoints have none
         self.sequence[:] = self.owner[self.frame]
         self.rng = rng_from_state(meta["rng"])
         self.batch.forward(None, STAGE_VEL)

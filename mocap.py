@@ -405,6 +405,56 @@ def place(clip: Clip, yaw: float, pivot, to) -> Clip:
     return replace(clip, pos=move(clip.pos), ball=move(clip.ball), quat=quat_mul(quat_about(2, yaw), clip.quat))
 
 
+# ------------------------------------------------------------------------------------ other users, other gaits
+
+_MIRRORED = tuple(SEG[s[:-2] + {"_l": "_r", "_r": "_l"}[s[-2:]] if s[-2:] in ("_l", "_r") else s] for s in SEGMENTS)
+_ARMS = tuple(tuple(SEG[f"{s}_{side}"] for s in ("upper_arm", "forearm", "hand")) for side in "lr")
+
+
+def mirror(clip: Clip) -> Clip:
+    r"""The clip seen in a mirror: left and right change places.
+
+    Equation  p' = M p, R' = M R M with M = diag(1, -1, 1); in quaternions (w, x, y, z) -> (w, -x, y, -z)
+    Why       the anatomical frames are symmetric, so that M R M is the other side's frame
+    Test      tests/test_mocap.py::test_mirror
+    """
+    flip = np.array([1.0, -1.0, 1.0])
+    quat = clip.quat[:, _MIRRORED] * [1.0, -1.0, 1.0, -1.0]
+    pos, ball = clip.pos[:, _MIRRORED] * flip, clip.ball[:, ::-1] * flip
+    return replace(clip, name=f"{clip.name}-mirrored", pos=pos, quat=quat, ball=ball)
+
+
+def warp(clip: Clip, speed: float) -> Clip:
+    """The clip played `speed` times as fast, at the same frame rate.  Test: tests/test_mocap.py::test_warp."""
+    return resample(replace(clip, name=f"{clip.name}-speed{speed:.2f}", rate=clip.rate * speed), clip.rate)
+
+
+def resize(clip: Clip, height=1.0, arms=1.0) -> Clip:
+    """The same motion by a user `height` times as tall, whose arms are `arms` times as long in proportion.
+
+    All positions grow, travel included: a taller person's steps are longer.
+    Test      tests/test_mocap.py::test_resize
+    """
+    pos = clip.pos * height
+    for shoulder, elbow, hand in _ARMS:
+        upper, fore = pos[:, elbow] - pos[:, shoulder], pos[:, hand] - pos[:, elbow]
+        pos[:, elbow] = pos[:, shoulder] + arms * upper
+        pos[:, hand] = pos[:, elbow] + arms * fore
+    tag = f"-h{height:.2f}a{arms:.2f}"
+    return replace(clip, name=clip.name + tag, body=clip.body + tag, pos=pos, ball=clip.ball * height)
+
+
+def augment(clips: list[Clip], rng: np.random.Generator, speed=0.15, height=0.2, arms=0.2) -> list[Clip]:
+    """Every clip, and its mirror image at a random speed by a user of random height and arm length.
+
+    Args      speed, height, arms : ranges, as shares: speed in 1 +- speed, and so on
+    Returns   twice as many clips, the given ones first
+    Test      tests/test_mocap.py::test_augment
+    """
+    draw = lambda r: float(rng.uniform(1.0 - r, 1.0 + r))  # noqa: E731
+    return list(clips) + [resize(warp(mirror(c), draw(speed)), draw(height), draw(arms)) for c in clips]
+
+
 # ------------------------------------------------------------------------------------ what the user wears, and the feet
 
 # Where a headset and two controllers sit, in the frames of head and hands [m].  ASSUMED: the paper only says "offset".
@@ -486,7 +536,7 @@ class StitchReport:
             return text + "no joins needed"
         if self.joins:
             d = 100 * np.array(self.distances)
-            text += f"{self.joins} joins at {d.mean():.1f} cm mean ({d.max():.1f} max, limit {100 * self.limit:.0f})"
+            text += f"{self.joins} joins at {d.mean():.1f} cm mean ({d.max():.1f} max, limit {100 * self.limit:g})"
         else:
             text += "no joins"
         text += f"; {100 * self.frames_used / max(self.frames, 1):.0f} % of frames used"
@@ -731,6 +781,8 @@ def main(argv=None) -> None:
     sub = parser.add_subparsers(dest="command", required=True)
     p = sub.add_parser("inspect", help="print skeleton, rate, length, speed and contacts")
     p.add_argument("path", help="a .bvh file, or a folder of them")
+    for each in (parser, p):  # one line, as in runs.cli
+        each.error = lambda message: parser.exit(2, f"mocap.py: error: {message} (see --help)\n")
     inspect(parser.parse_args(argv).path)
 
 

@@ -28,6 +28,8 @@ from runs import NONNEGATIVE, POSITIVE, UserError, arg, atomic_write, cli, run_m
 
 @dataclass
 class Options:
+    """Which policy, on which motion, and what to make of it."""
+
     character: str = arg("jesse", "name in characters/, or path of a .toml")
     motion: str = arg("builtin", "builtin, a .bvh file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names")
@@ -91,8 +93,9 @@ def pd_action(env: Env):
 class Recording:
     """What a character did on one sequence.
 
-    frames : (T,) reference frames, the start included; qpos (T, nq); contact (T, 2) bool; action (T, u), of the step
-    that led to the frame (zero at the start); failed : bool; available : steps the sequence had to offer
+    frames : (T,) reference frames, the start included; qpos (T, nq); contact (T, 2) bool, the human's at the start;
+    action (T, u), of the step that led to the frame (zero at the start); failed : bool; available : steps the
+    sequence had to offer
     """
 
     frames: np.ndarray
@@ -121,7 +124,7 @@ def simulate(char: Character, ref: Reference, act, horizon=EPISODE_STEPS, thread
         _, _, terminated, truncated, _ = env.step(act(env))
         qpos.append(env.qpos.copy()), contact.append(env.contact.copy()), action.append(env.action.copy())
         failed |= alive & terminated
-        lived += alive & ~terminated
+        lived += alive & ~terminated & (env.steps <= available)  # a single frame has no step to offer
         alive &= ~(terminated | truncated)
     qpos, contact, action = np.stack(qpos, 1), np.stack(contact, 1), np.stack(action, 1)
     return [
@@ -142,13 +145,10 @@ def kinematic(char: Character, ref: Reference, horizon=EPISODE_STEPS) -> list[Re
     out = []
     for a, b in zip(ref.first, ref.last, strict=True):
         frames = np.arange(a, min(b, a + horizon) + 1)
-        height, speed = sole_motion(forward_kinematics(char, ref.qpos[frames]).soles, mocap.CONTROL_RATE)
+        height, speed = sole_motion(forward_kinematics(char, ref.qpos[frames]).soles, ref.rate)
         contact = (height < 0.02) & (speed < mocap.CONTACT_SPEED)
-        out.append(
-            Recording(
-                frames, ref.qpos[frames], contact, np.zeros((len(frames), len(char.limits))), False, len(frames) - 1
-            )
-        )
+        action = np.zeros((len(frames), len(char.limits)))
+        out.append(Recording(frames, ref.qpos[frames], contact, action, False, len(frames) - 1))
     return out
 
 
@@ -159,7 +159,7 @@ def time_to_failure(char, ref, act, n=256, seconds=20.0, seed=0, threads=0) -> f
     """
     env = Env(char, ref, n, seed=seed, threads=threads)
     env.reset(seed)
-    failures, steps = 0, int(seconds / env.dt)
+    failures, steps = 0, round(seconds / env.dt)
     for _ in range(steps):
         failures += int(env.step(act(env))[2].sum())
     return n * steps * env.dt / failures if failures else float("inf")
@@ -202,16 +202,29 @@ def head_rates(quat, rate):
     return quat_rotate(quat_conj(quat), mocap.angular_velocity(quat, rate))[:, [0, 2]]
 
 
+def sip_bodies(char: Character):
+    """Upper arms and thighs, from the TOML's [metrics] table.  Test: tests/test_play.py::test_sip_bodies"""
+    m, names = char.model, char.spec.get("metrics", {}).get("sip", [])
+    found = [mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, str(n)) for n in names]
+    if not found or min(found) < 0:
+        valid = ", ".join(m.body(b).name for b in range(1, m.nbody))
+        raise UserError(f"{char.path}: [metrics] sip = {names} must name upper arms and thighs; bodies: {valid}")
+    return np.array(found)
+
+
 def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dict:
     """Every metric of spec/metrics over recordings, pooled over their frames.
 
     Frames lived count equally, whichever clip they are in; `completed` and `survival` say how many were lived.
-    Test      tests/test_play.py::test_metrics_of_kinematic, test_metrics_on_known_motion
+    Joints are the bodies of the joint map.  Contact and action are measured after steps, so not at the start.
+    Returns   key -> number; NaN where there was nothing to measure (no frame, no step, no metre travelled)
+    Test      tests/test_play.py::test_metrics_against_slow_loop, test_metrics_of_kinematic,
+              test_metrics_on_known_motion, test_nothing_to_measure
     """
-    m, rate = char.model, mocap.CONTROL_RATE
+    m, rate = char.model, ref.rate
     bodies = np.array(sorted({b for b, *_ in char.chains}))
     parents = m.body_parentid
-    sip = np.array([mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, n) for n in char.spec["metrics"]["sip"]])
+    sip = sip_bodies(char)
     rows, sums = [], {}
     add = lambda key, total, count: sums.__setitem__(key, np.add(sums.get(key, (0.0, 0)), (total, count)))  # noqa: E731
     mean_over = lambda key, values: add(key, float(np.sum(values)), np.size(values))  # noqa: E731
@@ -230,7 +243,7 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
         mean_over("joint_rot_deg", np.degrees(quat_angle(*local)))
         mean_over("sip_deg", np.degrees(quat_angle(sim.xquat[:, sip], kin.xquat[:, sip])))
         height, speed = sole_motion(sim.soles, rate)
-        mean_over("foot_slide_cm_s", 100 * speed[ref.contact[f]])
+        mean_over("foot_slide_cm_s", 100 * speed[ref.contact[f]] if len(f) > 1 else [])
         lowest = np.minimum(height.min(1), sim.fall_height)
         mean_over("penetration_mm", -1000 * lowest[lowest < 0])
         mean_over("contact_agreement", rec.contact[1:] == ref.contact[f[1:]])
@@ -238,9 +251,8 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
         add("human_jitter_m_s3", *jitter(ref.human_pos[f].astype(float), rate))
         add("steps_per_m", footfalls(rec.contact), travelled(rec.qpos))
         add("human_steps_per_m", footfalls(ref.contact[f]), travelled(ref.human_pos[f, 0]))
-        if len(f) > 2:
-            wobble = head_rates(sim.xquat[:, char.head], rate) - head_rates(ref.orientation[f, 1], rate)
-            mean_over("head_wobble_deg_s", np.degrees(wobble) ** 2)
+        wobble = head_rates(sim.xquat[:, char.head], rate) - head_rates(ref.orientation[f, 1], rate)
+        mean_over("head_wobble_deg_s", np.degrees(wobble) ** 2 if len(f) > 2 else [])
         mean_over("torque_rms", rec.action[1:] ** 2)
         mean_over("saturation", np.abs(rec.action[1:]) > 0.99)
     out = {
@@ -248,9 +260,10 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
         "completed": float(np.mean([r[0] for r in rows])),
         "survival": float(np.mean([r[1] for r in rows])),
     }
-    out |= {k: float(total / count) if count else 0.0 for k, (total, count) in sums.items()}
-    for root in ("head_wobble_deg_s", "torque_rms"):
-        out[root] = float(np.sqrt(out.get(root, 0.0)))
+    out |= {k: float(total / count) if count else float("nan") for k, (total, count) in sums.items()}
+    out["penetration_mm"] = float(np.nan_to_num(out["penetration_mm"]))  # 0: never below the floor
+    for key in ("head_wobble_deg_s", "torque_rms"):
+        out[key] = float(np.sqrt(out[key]))
     return out
 
 
@@ -277,21 +290,34 @@ COLUMNS = (  # key, heading, format
 
 
 def table(results: dict) -> str:
-    """The rows as Markdown.  The kinematic row completes by definition and has no torque: printed as a dash."""
+    """The rows as Markdown; a dash where there is nothing to measure.
+
+    The kinematic row completes by definition and has no torque: printed as a dash too.
+    Test      tests/test_play.py::test_table
+    """
     lines = ["| | " + " | ".join(h for _, h, _ in COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
     for name, row in results.items():
         dash = {"completed", "survival", "fails_every_s", "torque_rms", "saturation"} if name == "kinematic" else set()
-        cells = [
-            "-" if k in dash or k not in row else "never" if row[k] == np.inf else fmt.format(row[k])
-            for k, _, fmt in COLUMNS
-        ]
+        cells = ["-" if k in dash else cell(row.get(k, np.nan), fmt) for k, _, fmt in COLUMNS]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    human = next(iter(results.values()))
-    lines.append(
-        f"\nthe human: jitter {human['human_jitter_m_s3']:.0f} m/s³, {human['human_steps_per_m']:.2f} steps/m; "
-        f"{human['clips']} sequences"
-    )
+    human = results.get("kinematic", row)  # the kinematic row has every frame
+    jitter, pace = cell(human["human_jitter_m_s3"], "{:.0f}"), cell(human["human_steps_per_m"], "{:.2f}")
+    lines.append(f"\nthe human: jitter {jitter} m/s³, {pace} steps/m; {human['clips']} sequences")
     return "\n".join(lines)
+
+
+def cell(value, fmt):
+    """A number as text: a dash for NaN, `never` for infinity."""
+    return "-" if np.isnan(value) else "never" if value == np.inf else fmt.format(value)
+
+
+def as_json(results: dict) -> str:
+    """The same rows as JSON; null for NaN (nothing to measure) and infinity (never failed).
+
+    Test      tests/test_play.py::test_measure_json
+    """
+    clean = {name: {k: v if np.isfinite(v) else None for k, v in row.items()} for name, row in results.items()}
+    return json.dumps(clean, indent=2, allow_nan=False) + "\n"
 
 
 def measure_all(char, ref, policy, opt: Options) -> dict:
@@ -313,7 +339,11 @@ def measure_all(char, ref, policy, opt: Options) -> dict:
 
 
 def pictures(char: Character, ref: Reference, recording: Recording, frames, size=(480, 360), fast=False):
-    """Images (H, W, 3) of the character with the three sensor poses it was given; frames : indices into the recording."""
+    """Images (H, W, 3) of the character with the three sensor poses it was given.
+
+    Args      frames : indices into the recording
+    Test      tests/test_cli.py::test_play_png
+    """
     import render
 
     shown = retarget.character(char.path, visual=True).model
@@ -369,7 +399,10 @@ def show(char: Character, ref: Reference, policy, sequence: int, how: str, port:
 
 
 def _shown_model(char: Character, ref: Reference):
-    """The character with its visual shapes, and a box with axes for each sensor, to be placed as mocap bodies."""
+    """The character with its visual shapes, and a box with axes for each sensor, to be placed as mocap bodies.
+
+    Test      tests/test_play_view.py::test_shown_model
+    """
     import render
 
     spec = mujoco.MjSpec.from_file(str(char.path.parent / char.spec.get("model", char.path.stem + ".xml")))
@@ -385,7 +418,10 @@ def _shown_model(char: Character, ref: Reference):
 
 
 def _open_viewer(model, data, root, how, port):
-    """A handle with is_running(), sync() and close(); the camera follows the body `root`, collision shapes are hidden."""
+    """A handle with is_running(), sync(), close(). The camera follows the body `root`; collision shapes are hidden.
+
+    Test      tests/test_play_view.py::test_taken_port_is_named, test_window_needs_a_display
+    """
     import warnings
 
     def look(camera, option):
@@ -433,15 +469,17 @@ def _open_viewer(model, data, root, how, port):
 
 def find_policy(opt: Options):
     """The policy named, or the shipped one; UserError says how to make one."""
-    path = Path(opt.policy) if opt.policy else retarget.CHARACTERS / f"{Path(opt.character).stem}.npz"
+    name = Path(opt.character)
+    shipped = name.with_suffix(".npz") if name.suffix == ".toml" else retarget.CHARACTERS / f"{name}.npz"
+    path = Path(opt.policy) if opt.policy else shipped
     if not path.exists():
-        raise UserError(
-            f"no policy {path}: train one (python ppo.py --character {opt.character} --out runs/a), then --policy runs/a"
-        )
+        make = f"python ppo.py --character {opt.character} --out runs/a"
+        raise UserError(f"no policy {path}: train one ({make}), then --policy runs/a")
     return load_policy(path)[0], path
 
 
 def main(argv=None):
+    """python play.py: measure, picture, film or show a policy.  Test: tests/test_play.py::test_measure_json"""
     argv = list(argv or [])
     for i, a in enumerate(argv):  # --view alone means a window
         if a == "--view" and (i + 1 == len(argv) or argv[i + 1].startswith("--")):
@@ -449,6 +487,11 @@ def main(argv=None):
     opt = cli(Options, argv, "play.py", __doc__)
     if not (opt.measure or opt.png or opt.video or opt.view):
         raise UserError("nothing to do: give --measure, --png OUT, --video OUT or --view")
+    for out in filter(None, (opt.json, opt.png, opt.video)):
+        if not Path(out).resolve().parent.is_dir():
+            raise UserError(f"cannot write {out}: there is no folder {Path(out).parent}")
+    if opt.json and not opt.measure:
+        raise UserError("--json writes the table of --measure: give both")
     char = retarget.character(opt.character)
     policy, path = find_policy(opt)
     clips = mocap.sequences(opt.motion, "all" if opt.all else opt.split, opt.clips, seed=opt.seed)
@@ -460,8 +503,7 @@ def main(argv=None):
         results = measure_all(char, ref, policy, opt)
         print(table(results))
         if opt.json:
-            clean = {n: {k: v if np.isfinite(v) else None for k, v in row.items()} for n, row in results.items()}
-            atomic_write(opt.json, json.dumps(clean, indent=2) + "\n")
+            atomic_write(opt.json, as_json(results))
     if opt.png or opt.video:
         import render
 

@@ -20,7 +20,7 @@ import numpy as np
 
 import mocap
 import retarget
-from env import EPISODE_STEPS, Env
+from env import EPISODE_STEPS, Disturbance, Env
 from nn import (
     MLP,
     Adam,
@@ -68,7 +68,7 @@ class Options:
     clips: str = arg("*", "shell pattern on clip names, such as '*walk*'")
     steps: int = arg(20_000_000, "control steps to train", check=POSITIVE)
     envs: int = arg(512, "characters simulated side by side", check=POSITIVE)
-    horizon: int = arg(32, "control steps of each character per update", check=POSITIVE)
+    horizon: int = arg(16, "control steps of each character per update", check=POSITIVE)
     seed: int = arg(0, "seed of everything random", check=NONNEGATIVE)
     out: str | None = arg(None, "run folder; runs/CHARACTER by default")
     resume: bool = arg(False, "continue the run in --out exactly")
@@ -79,7 +79,7 @@ class Options:
     lam: float = arg(0.95, "lambda of generalised advantage estimation; 1 is Appendix B's return", check=UNIT)
     clip_eps: float = arg(0.2, "epsilon of the clipped loss", check=POSITIVE)
     epochs: int = arg(4, "passes over the samples per update", check=POSITIVE)
-    minibatch: int = arg(4096, "samples per gradient step", check=POSITIVE)
+    minibatch: int = arg(2048, "samples per gradient step", check=POSITIVE)
     lr: float = arg(1e-4, "policy's learning rate to start from; adapted to --target-kl", check=POSITIVE)
     value_lr: float = arg(1e-3, "value network's learning rate", check=POSITIVE)
     target_kl: float = arg(0.025, "KL divergence per update that the policy's learning rate aims at", check=POSITIVE)
@@ -88,6 +88,10 @@ class Options:
     value_hidden: tuple[int, ...] = arg((256, 128), "hidden layers of the value network", check=ALL_POSITIVE)
     sigma: float = arg(0.135, "standard deviation of the exploration noise at the start", check=POSITIVE)
     min_sigma: float = arg(0.05, "below this the standard deviations do not fall", check=POSITIVE)
+    augment: bool = arg(False, "also mirrored clips at other speeds, by users of other heights and arm lengths")
+    sensor_offset: float = arg(0.0, "constant error of device positions in an episode [m]", check=NONNEGATIVE)
+    sensor_noise: float = arg(0.0, "white noise on device positions [m]", check=NONNEGATIVE)
+    push: float = arg(0.0, "largest random push, every 2 s on average [m/s]", check=NONNEGATIVE)
     episode: int = arg(EPISODE_STEPS, "control steps to truncation [§3.6]", check=POSITIVE)
 
 
@@ -181,7 +185,10 @@ def critic_loss(policy: Policy, x, target):
 
 
 def explained_variance(value, target):
-    """1 − Var(target − value) / Var(target): 1 is a perfect critic, 0 as good as the mean."""
+    """1 − Var(target − value) / Var(target): 1 is a perfect critic, 0 as good as the mean.
+
+    Test      tests/test_ppo.py::test_explained_variance
+    """
     var = np.var(target)
     return float(1.0 - np.var(target - value) / var) if var > 0 else 0.0
 
@@ -251,7 +258,7 @@ def load_policy(path) -> tuple[Policy, dict]:
 
     Returns   Policy with the normaliser frozen; meta with "options", "steps" and what else was saved
     Raises    UserError: missing, damaged, or not a policy
-    Test      tests/test_ppo.py::test_policy_round_trip
+    Test      tests/test_ppo.py::test_policy_round_trip, test_broken_policies
     """
     path = Path(path)
     names = ("policy.pi", "policy.critic", "policy.norm.mean", "policy.norm.m2")
@@ -285,7 +292,7 @@ def check_fits(policy: Policy, env: Env, path):
 class Trainer:
     """Collect, estimate, update; all state that a resumed run needs.
 
-    Test: tests/test_ppo.py::test_resume_is_exact, test_learns
+    Test      tests/test_ppo.py::test_resume_is_exact, test_learns, test_non_finite_state_does_not_reach_the_networks
     """
 
     def __init__(self, opt: Options, env: Env):
@@ -315,7 +322,10 @@ class Trainer:
             self.policy.norm.update(self.env.full)
 
     def collect(self) -> dict:
-        """`horizon` steps of every environment with the present policy.  -> what happened, for the progress line"""
+        """`horizon` steps of every environment with the present policy.  -> what happened, for the progress line
+
+        Test      tests/test_ppo.py::test_stored_action_is_unclipped
+        """
         env, policy, norm = self.env, self.policy, self.policy.norm
         finals = []  # (t, ids, rows): observations at truncations, before the reset
         sums = dict.fromkeys(TERMS, 0.0)
@@ -357,7 +367,10 @@ class Trainer:
         return stats | {f"end_{k}": v for k, v in ends.items()}
 
     def _values(self, finals):
-        """V(o_t) and V(o_{t+1}) of everything collected, with the old network."""
+        """V(o_t) and V(o_{t+1}) of everything collected, with the old network.
+
+        Test      tests/test_ppo.py::test_bootstrap_is_before_the_reset
+        """
         env, policy = self.env, self.policy
         t, n = self.reward.shape
         self.old_value = policy.value(self.x.reshape(t * n, -1)).reshape(t, n)
@@ -368,7 +381,10 @@ class Trainer:
         self.next_value[self.terminated] = 0.0
 
     def update(self) -> dict:
-        """Several epochs of minibatches of the two losses; then the learning rate follows the KL divergence."""
+        """Several epochs of minibatches of the two losses; then the learning rate follows the KL divergence.
+
+        Test      tests/test_ppo.py::test_update_improves_both_losses, test_rate_follows_kl_and_sigma_has_a_floor
+        """
         opt, policy = self.opt, self.policy
         done = self.terminated | self.truncated
         advantage, target = gae(self.reward, self.old_value, self.next_value, done, opt.gamma, opt.lam)
@@ -459,11 +475,18 @@ def fingerprint(ref) -> str:
     return hashlib.sha256(np.ascontiguousarray(ref.qpos)).hexdigest()[:16]
 
 
-def make_env(opt: Options, split="train", n=None) -> Env:
-    """Character, stitched sequences of the split, environment."""
+def make_env(opt: Options) -> Env:
+    """Character, stitched training sequences, augmented if asked for, environment.
+
+    Test      tests/test_ppo.py::test_make_env_augments
+    """
     char = retarget.character(opt.character)
-    ref = retarget.reference(char, mocap.sequences(opt.motion, split, opt.clips, seed=opt.seed))
-    return Env(char, ref, n or opt.envs, opt.seed, opt.threads, opt.episode)
+    clips = mocap.sequences(opt.motion, "train", opt.clips, seed=opt.seed)
+    if opt.augment:
+        clips = mocap.augment(clips, np.random.default_rng([opt.seed, 3]))
+    disturbance = Disturbance(opt.sensor_offset, opt.sensor_noise, opt.push)
+    ref = retarget.reference(char, clips)
+    return Env(char, ref, opt.envs, opt.seed, opt.threads, opt.episode, disturbance=disturbance)
 
 
 CHANGEABLE = ("steps", "threads", "checkpoint_minutes", "resume", "out")
@@ -493,7 +516,10 @@ def resumed_options(opt: Options, argv) -> Options:
 
 
 class StopFlag:
-    """Ctrl-C or SIGTERM ends the run after the present update, with a checkpoint; a second one at once."""
+    """Ctrl-C or SIGTERM ends the run after the present update, with a checkpoint; a second one at once.
+
+    Test      tests/test_ppo.py::test_interrupt_ends_with_a_checkpoint
+    """
 
     def __enter__(self):
         self.stop = False
@@ -588,6 +614,7 @@ def progress_line(s) -> dict:
 
 
 def main(argv=None):
+    """python ppo.py: train, or resume.  Test: tests/test_cli.py::test_ppo"""
     opt = cli(Options, argv, "ppo.py", __doc__)
     opt = replace(opt, out=opt.out or f"runs/{Path(opt.character).stem}")
     if opt.resume:

@@ -332,6 +332,8 @@ class _Loader:
                 self.fail(f"[passive.armature] has no entry for {g}")
             m.jnt_stiffness[1 + h], m.dof_damping[6 + h] = k * limit, d * limit
             m.dof_armature[6 + h] = armature(g)
+        # MuJoCo scales the softness of contacts and limits by inverse inertias it computed without this armature: again
+        mujoco.mj_setConst(m, mujoco.MjData(m))
 
     def body_for(self, segment):
         """The last body of the map that follows a human segment."""
@@ -707,6 +709,8 @@ def artefacts(char: Character, clip: Clip, pose: Pose) -> dict:
 
 @dataclass
 class Options:
+    """What `python retarget.py` can be told."""
+
     character: str = arg("jesse", "name in characters/, or path of a .toml")
     motion: str = arg("builtin", "builtin, a .bvh file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names")
@@ -736,6 +740,9 @@ def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360)):
 
 
 def main(argv=None):
+    """Print the artefacts of every clip's kinematic pose; draw the first one.
+
+    Test      tests/test_retarget.py::test_command_line"""
     opt = cli(Options, argv, "retarget.py", __doc__)
     char = character(opt.character)
     clips = mocap.load(opt.motion, clips=opt.clips)

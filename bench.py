@@ -1,0 +1,165 @@
+r"""How fast it is: every part of training beside the physics it cannot beat, in one run.
+
+    python bench.py                                  every character
+    python bench.py --character jesse --json OUT     characters.NAME.{physics, environment, inference, update, train, ...}
+    python bench.py --scaling                        1 and all threads, 64 to 4,096 environments
+
+physics       bare `mujoco.rollout` of the same model and substeps, from the same states
+environment   `Env.step`: physics, refresh, reward, termination, reset, observation
+inference     normalise, actor, noise, log-probability
+update        all epochs of both losses, per collected step
+train         collect and update, as ppo.py does
+
+All in control steps a second.  The parts are timed in turn, round after round, and each figure is the median over the rounds: a
+disturbance of the machine hits all of them, so the ratios can be trusted where the bare times cannot.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import time
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+import mocap
+import ppo
+import retarget
+from env import SUBSTEPS, Env
+from nn import gaussian_logp
+from runs import NONNEGATIVE, POSITIVE, arg, atomic_write, cli, run_main, versions
+
+
+@dataclass
+class Options:
+    character: str | None = arg(None, "one character; all of them by default")
+    motion: str = arg("builtin", "builtin, a .bvh file, or a folder of them")
+    clips: str = arg("*", "shell pattern on clip names")
+    envs: int = arg(512, "characters simulated side by side", check=POSITIVE)
+    threads: int = arg(0, "physics threads, 0 = all cores", check=NONNEGATIVE)
+    rounds: int = arg(7, "how often each part is timed", check=POSITIVE)
+    scaling: bool = arg(False, "also the table over threads and environments")
+    json: str | None = arg(None, "write the figures here")
+
+
+class Physics:
+    """Bare `mujoco.rollout`: the limit.  States of the reference, noise as control, started anew every 16 control steps."""
+
+    def __init__(self, env: Env, rng):
+        self.env, self.rng, self.steps = env, rng, 0
+        m = env.char.model
+        threads = env.batch.nthread
+        self.data = [mujoco.MjData(m) for _ in range(threads)]
+        self.pool = rollout.Rollout(nthread=threads)
+        spec = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
+        probe, self.fresh = mujoco.MjData(m), np.zeros((env.n, mujoco.mj_stateSize(m, spec)))
+        for i, f in enumerate(rng.choice(env.starts, env.n)):
+            probe.qpos[:], probe.qvel[:] = env.ref.qpos[f], env.ref.qvel[f]
+            mujoco.mj_getState(m, probe, self.fresh[i], spec)
+
+    def step(self):
+        if self.steps % 16 == 0:
+            self.state = self.fresh
+        self.steps += 1
+        control = 0.13 * self.rng.standard_normal((self.env.n, 1, self.env.action_size))
+        states, _ = self.pool.rollout(
+            self.env.char.model, self.data, self.state, np.repeat(control, SUBSTEPS, axis=1), skip_checks=False
+        )
+        self.state = states[:, -1]
+
+
+def bench(char, ref, opt: Options) -> dict:
+    """All figures of one character.
+
+    Test      tests/test_bench.py::test_bench_json
+    """
+    settings = ppo.Options(envs=opt.envs, threads=opt.threads)
+    env = Env(char, ref, opt.envs, threads=opt.threads)
+    trainer = ppo.Trainer(settings, env)
+    trainer.start()
+    trainer.collect(), trainer.update()  # warm
+    rng = np.random.default_rng(0)
+    physics = Physics(Env(char, ref, opt.envs, threads=opt.threads), rng)
+    noise = lambda: 0.13 * rng.standard_normal((env.n, env.action_size))  # noqa: E731
+    policy, horizon = trainer.policy, settings.horizon
+
+    def infer():
+        x = policy.norm.normalise(env.full)
+        mu = policy.actor(x[:, : env.obs_size])
+        a = mu + np.exp(policy.log_std) * rng.standard_normal(mu.shape, dtype=np.float32)
+        gaussian_logp(a, mu, policy.log_std)
+
+    times = {k: [] for k in ("physics", "environment", "inference", "update", "train")}
+    for _ in range(opt.rounds):
+        times["physics"].append(_seconds(physics.step, horizon) / horizon)
+        times["environment"].append(_seconds(lambda: env.step(noise()), horizon) / horizon)
+        times["inference"].append(_seconds(infer, horizon) / horizon)
+        collect = _seconds(trainer.collect, 1)
+        update = _seconds(trainer.update, 1)
+        times["update"].append(update / horizon)
+        times["train"].append((collect + update) / horizon)
+    out = {k: float(opt.envs / np.median(t)) for k, t in times.items()}
+    out["train_of_physics"] = float(np.median(np.array(times["physics"]) / np.array(times["train"])))
+    out["environment_of_physics"] = float(np.median(np.array(times["physics"]) / np.array(times["environment"])))
+    p50, p99 = policy_step(char, ref, policy)
+    out |= {"policy_step_ms_p50": p50, "policy_step_ms_p99": p99}
+    out["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return out
+
+
+def policy_step(char, ref, policy, n=2000):
+    """Milliseconds to observe and infer for one character: median and 99th percentile.  The latency a headset would add."""
+    env = Env(char, ref, 1, threads=1)
+    env.reset()
+    times = []
+    for _ in range(n):
+        t = time.perf_counter()
+        env._observe(slice(None))
+        policy.mean_action(env.full[:, : env.obs_size])
+        times.append(time.perf_counter() - t)
+    return float(1e3 * np.percentile(times, 50)), float(1e3 * np.percentile(times, 99))
+
+
+def _seconds(f, repeats):
+    t = time.perf_counter()
+    for _ in range(repeats):
+        f()
+    return time.perf_counter() - t
+
+
+def main(argv=None):
+    opt = cli(Options, argv, "bench.py", __doc__)
+    names = [opt.character] if opt.character else retarget.available()
+    print(
+        f"{os.cpu_count()} cores, " + ", ".join(f"{k} {v}" for k, v in versions().items() if k in ("numpy", "mujoco"))
+    )
+    results = {}
+    for name in names:
+        char = retarget.character(name)
+        ref = retarget.reference(char, mocap.sequences(opt.motion, "train", opt.clips))
+        r = results[name] = bench(char, ref, opt)
+        print(f"\n{name}, {opt.envs} characters, control steps/s:")
+        for k in ("physics", "environment", "inference", "update", "train"):
+            print(f"  {k:12s} {r[k]:10,.0f}   {r[k] / r['physics']:6.2f} × physics")
+        print(
+            f"  policy step {r['policy_step_ms_p50']:.3f} ms (p99 {r['policy_step_ms_p99']:.3f});  peak {r['peak_mb']:,.0f} MB"
+        )
+        if opt.scaling:
+            print("  threads  envs   physics     train   of physics")
+            for threads in sorted({1, os.cpu_count()}):
+                for envs in (64, 256, 1024, 4096):
+                    s = bench(char, ref, replace(opt, threads=threads, envs=envs, rounds=3))
+                    results[name].setdefault("scaling", []).append({"threads": threads, "envs": envs} | s)
+                    print(
+                        f"  {threads:7d} {envs:5d} {s['physics']:9,.0f} {s['train']:9,.0f} {s['train_of_physics']:9.2f}"
+                    )
+    if opt.json:
+        atomic_write(opt.json, json.dumps({"characters": results, "versions": versions()}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    run_main(main)
