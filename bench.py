@@ -1,7 +1,7 @@
 r"""How fast it is: every part of training beside the physics it cannot beat, in one run.
 
     python bench.py                                  every character
-    python bench.py --character jesse --json OUT     characters.NAME.{physics, environment, inference, update, train, ...}
+    python bench.py --character jesse --json OUT     characters.NAME.{physics, environment, inference, update, ...}
     python bench.py --scaling                        1 and all threads, 64 to 4,096 environments
 
 physics       bare `mujoco.rollout` of the same model and substeps, from the same states
@@ -10,8 +10,8 @@ inference     normalise, actor, noise, log-probability
 update        all epochs of both losses, per collected step
 train         collect and update, as ppo.py does
 
-All in control steps a second.  The parts are timed in turn, round after round, and each figure is the median over the rounds: a
-disturbance of the machine hits all of them, so the ratios can be trusted where the bare times cannot.
+All in control steps a second.  The parts are timed in turn, round after round, and each figure is the median over the
+rounds: a disturbance of the machine hits all of them, so the ratios can be trusted where the bare times cannot.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ from runs import NONNEGATIVE, POSITIVE, arg, atomic_write, cli, run_main, versio
 
 @dataclass
 class Options:
+    """What to time, and how often."""
+
     character: str | None = arg(None, "one character; all of them by default")
     motion: str = arg("builtin", "builtin, a .bvh file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names")
@@ -47,7 +49,11 @@ class Options:
 
 
 class Physics:
-    """Bare `mujoco.rollout`: the limit.  States of the reference, noise as control, started anew every 16 control steps."""
+    """Bare `mujoco.rollout`: the limit.
+
+    From states of the reference, with noise as control, started anew every 16 control steps.
+    Test: tests/test_bench.py::test_physics_is_the_same_physics
+    """
 
     def __init__(self, env: Env, rng):
         self.env, self.rng, self.steps = env, rng, 0
@@ -112,7 +118,10 @@ def bench(char, ref, opt: Options) -> dict:
 
 
 def policy_step(char, ref, policy, n=2000):
-    """Milliseconds to observe and infer for one character: median and 99th percentile.  The latency a headset would add."""
+    """Milliseconds to observe and infer for one character, the latency a headset would see: median, 99th percentile.
+
+    Test: tests/test_bench.py::test_bench_json
+    """
     env = Env(char, ref, 1, threads=1)
     env.reset()
     times = []
@@ -132,6 +141,7 @@ def _seconds(f, repeats):
 
 
 def main(argv=None):
+    """Print the table of every character.  Test: tests/test_bench.py::test_bench_json"""
     opt = cli(Options, argv, "bench.py", __doc__)
     names = [opt.character] if opt.character else retarget.available()
     print(
@@ -146,7 +156,8 @@ def main(argv=None):
         for k in ("physics", "environment", "inference", "update", "train"):
             print(f"  {k:12s} {r[k]:10,.0f}   {r[k] / r['physics']:6.2f} × physics")
         print(
-            f"  policy step {r['policy_step_ms_p50']:.3f} ms (p99 {r['policy_step_ms_p99']:.3f});  peak {r['peak_mb']:,.0f} MB"
+            f"  policy step {r['policy_step_ms_p50']:.3f} ms (p99 {r['policy_step_ms_p99']:.3f});  "
+            f"peak {r['peak_mb']:,.0f} MB"
         )
         if opt.scaling:
             print("  threads  envs   physics     train   of physics")

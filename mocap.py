@@ -1,7 +1,7 @@
 r"""Human motion: one canonical human, whatever the rig  [Reda23 §3.4, App. A].
 
-    read a BVH ──► canonical Clip ──► resample ──► stitch ──► sensors, contacts
-    (bvh.py)       15 segments        30 Hz        ≥ 30 s     §3.4    App. A
+    read a file ──────► canonical Clip ──► resample ──► stitch ──► sensors, contacts
+    (bvh.py, amc.py)    15 segments        30 Hz        ≥ 30 s     §3.4    App. A
     or gait.py
 
 Everything after the reader speaks of one human only: 15 named segments, each with a joint centre and an
@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+import amc
 import bvh
 import gait
 from runs import UserError, run_main
@@ -164,7 +165,7 @@ class Clip:
     """A motion of the canonical human.
 
     name  : where it comes from
-    body  : whose body it is (from a BVH: rig and limb lengths); only clips of one body are stitched together
+    body  : whose body it is (from a file: rig or subject, and limb lengths); only clips of one body are stitched
     rate  : frames a second
     pos   : (T, 15, 3) joint centre at the near end of each segment [m], world; pelvis: midpoint of the hip joints
     quat  : (T, 15, 4) anatomical frame of each segment -> world
@@ -371,15 +372,148 @@ def _lowest(clip):
 
 
 def _clip_of(b, rig, name, root_offset):
-    pos, quat = bvh.global_pose(b, root_offset)
-    index = {n: i for i, n in enumerate(b.names)}
+    pose = bvh.global_pose(b, root_offset)
+    return _human(rig, _calibrations(name), b.names, *pose, Path(b.path).stem, name, 1.0 / b.frame_time)
+
+
+def _human(rig, calibrations, names, pos, quat, clip, body, rate):
+    """The canonical human in a file's joints (file units, y up)."""
+    index = {n: i for i, n in enumerate(names)}
     cols = [index[rig.joints[s]] for s in SEGMENTS]
     p = pos[..., [2, 0, 1]] * rig.unit
-    q = quat_mul(_Y_UP, quat_mul(quat[:, cols], _calibrations(name)))
+    q = quat_mul(_Y_UP, quat_mul(quat[:, cols], calibrations))
     joint_pos = p[:, cols].copy()
     joint_pos[:, 0] = 0.5 * (joint_pos[:, SEG["thigh_l"]] + joint_pos[:, SEG["thigh_r"]])
     ball = p[:, [index[n] for n in rig.balls]]
-    return Clip(Path(b.path).stem, name, 1.0 / b.frame_time, joint_pos, quat_continuous(q), ball)
+    return Clip(clip, body, rate, joint_pos, quat_continuous(q), ball)
+
+
+# CMU's skeletons: the same bones and zero pose for every subject, lengths and some directions of their own.  The head's
+# joint is where `head` starts: 9 cm below the headband, as in a skull.  The forearm is `radius` and `wrist` together:
+# `wrist` only pronates, and `hand` flexes.  `thorax` starts in the middle of the back.
+CMU_BONES = dict(
+    pelvis="root", chest="thorax", head="head",
+    thigh_l="lfemur", shin_l="ltibia", foot_l="lfoot", thigh_r="rfemur", shin_r="rtibia", foot_r="rfoot",
+    upper_arm_l="lhumerus", forearm_l="lradius", hand_l="lhand",
+    upper_arm_r="rhumerus", forearm_r="rradius", hand_r="rhand",
+)  # fmt: skip
+# Degrees, means over subjects 07, 08, 16, 35.  In straight walks the head looks down by 15 (10 to 18), and people look
+# ahead (ASSUMED).  With ankle and ball both slower than 0.25 m/s the sole, square to the shank in the zero pose, points
+# down by 2.9 (1.9 to 5.0).
+CMU_PITCH = dict(head=15.0, foot_l=2.9, foot_r=2.9)
+INCH = 0.0254  # m; CMU's unit is 1 / (:units length) inches
+AMC_RATE = 120.0  # Hz of CMU's AMC files, which do not say it
+
+
+def cmu_rig(skeleton: amc.Skeleton) -> Rig:
+    r"""The rig of a CMU skeleton, from its zero pose: a T-pose with splayed legs, all bones' frames being the file's.
+
+    Method    up: against the bone (thigh, shin, arm, hand), the file's y (trunk, head), the shin's (foot).
+              left: the knee's axis, with which the shin bends back, for the leg; against the elbow's axis, with which
+              the forearm bends forward, for upper arm and forearm; in the hand the T-pose's palms face down and the
+              thumbs forward, so left is up (left hand) or down.  Knee and elbow turn about x of their `axis`
+    Frame     of the file: x left, y up, z forward
+    Raises    UserError: bones are missing, or a knee or an elbow has no rx; names them
+    Test      tests/test_amc.py::test_zero_pose_is_a_t_pose, ::test_cmu_anatomy, ::test_unknown_skeleton
+    """
+    index = {n: i for i, n in enumerate(skeleton.names)}
+    wanted = {*CMU_BONES.values(), "ltoes", "rtoes"}
+    hinges = {"ltibia", "rtibia", "lradius", "rradius"}
+    missing = sorted(wanted - set(index)) or sorted(n for n in hinges if "rx" not in skeleton.dofs[index[n]])
+    if missing:
+        raise UserError(
+            f"{skeleton.path}: no CMU skeleton: {', '.join(missing)} missing or without rx; "
+            f"it has {', '.join(skeleton.names)}"
+        )
+
+    def hinge(name):
+        i = index[name]
+        return Rotation.from_euler(skeleton.axis_orders[i], skeleton.axes[i]).apply([1.0, 0.0, 0.0])
+
+    axes = dict.fromkeys(("pelvis", "chest", "head"), _frame("x", "y"))
+    for side, palm in (("l", "y"), ("r", "-y")):
+        up = {s: -skeleton.directions[index[side + s]] for s in ("femur", "tibia", "humerus", "radius", "hand")}
+        knee, elbow = hinge(f"{side}tibia"), -hinge(f"{side}radius")
+        axes[f"thigh_{side}"], axes[f"shin_{side}"] = _frame(knee, up["femur"]), _frame(knee, up["tibia"])
+        axes[f"foot_{side}"] = axes[f"shin_{side}"]
+        axes[f"upper_arm_{side}"], axes[f"forearm_{side}"] = _frame(elbow, up["humerus"]), _frame(elbow, up["radius"])
+        axes[f"hand_{side}"] = _frame(palm, up["hand"])
+    return Rig(CMU_BONES, axes, ("ltoes", "rtoes"), CMU_PITCH, INCH / skeleton.length)
+
+
+def from_amc(path, rate=AMC_RATE) -> Clip:
+    """Read a CMU motion as the canonical human; its skeleton lies beside it.
+
+    Symbols   as in `from_bvh`; unit 0.0254 / (:units length) m; the balls of the feet are where the toes start
+    Frame     world, floor at z = 0, metres; made level by `level`
+    Args      path : SUBJECT_TRIAL.amc beside SUBJECT.asf, or beside a single .asf of any name
+              rate : [Hz] of the file, which does not hold it; CMU's are 120
+    Returns   Clip at that rate, body cmu-SUBJECT with lengths of leg and arm
+    Raises    UserError: cannot be opened, malformed, no skeleton beside it, or not CMU's; names what was looked for
+    Test      tests/test_amc.py::test_from_amc_against_matrices, ::test_skeleton_beside, ::test_cmu_anatomy
+    """
+    s, motion = _read_amc(path)
+    rig = cmu_rig(s)
+    calibrations = np.stack([rig.calibration(segment) for segment in SEGMENTS])
+    pose = amc.global_pose(s, motion)
+    clip = level(_human(rig, calibrations, s.names, *pose, Path(path).stem, "", float(rate)))
+    return replace(clip, body=_body(f"cmu-{Path(s.path).stem}", clip))
+
+
+LEVEL_SPREAD, LEVEL_LIMIT = 0.2, 3.0  # m; degrees
+
+
+def level(clip: Clip) -> Clip:
+    r"""The clip turned about the origin so that the floor under its standing feet is level.
+
+    Why       the floor of CMU's subjects 07 and 08 rises by 1.8 to 2.1 cm a metre: 6 cm from end to end of a walk
+    Equation  g = argmin mean_i (h_i − g·x_i)² + s² |g|²; h_i, x_i: height and place of a standing ball, both less that
+              foot's means.  s = 0.2 m: where the feet spread less than that, as across a straight walk, g stays 0.
+              Then a turn by atan |g| about (−g_y, g_x, 0)
+    ASSUMED   the floor is a plane through the capture's origin: there the balls of all four subjects stand 3 to 5 cm
+              high.  More than 3 degrees are stairs or a ramp, which stay
+    Test      tests/test_amc.py::test_level, ::test_cmu_floor
+    """
+    standing = (clip.ball[..., 2] < CONTACT_HEIGHT) & (
+        np.linalg.norm(linear_velocity(clip.ball, clip.rate), axis=-1) < CONTACT_SPEED
+    )
+    feet = [clip.ball[standing[:, k], k] for k in (0, 1) if standing[:, k].any()]
+    if not feet:
+        return clip
+    d = np.concatenate([f - f.mean(axis=0) for f in feet])
+    x, h = d[:, :2], d[:, 2]
+    g = np.linalg.solve(x.T @ x / len(x) + LEVEL_SPREAD**2 * np.eye(2), x.T @ h / len(x))
+    steep = np.linalg.norm(g)
+    angle = np.arctan(steep)
+    if not 0.0 < angle < np.radians(LEVEL_LIMIT):
+        return clip
+    q = np.array([np.cos(angle / 2), *np.sin(angle / 2) / steep * np.array([-g[1], g[0], 0.0])])
+    return replace(clip, pos=quat_rotate(q, clip.pos), ball=quat_rotate(q, clip.ball), quat=quat_mul(q, clip.quat))
+
+
+def _read_amc(path):
+    """Skeleton and motion of an .amc file."""
+    path = Path(path)
+    beside = sorted(f for f in path.parent.glob("*") if f.suffix.lower() == ".asf")
+    subject = path.stem.rpartition("_")[0] or path.stem
+    skeleton = [f for f in beside if f.stem == subject] or beside
+    try:
+        if path.exists() and len(skeleton) != 1:
+            found = ", ".join(f.name for f in beside[:6]) or "none"
+            raise UserError(
+                f"{path}: no skeleton beside it: looked for {subject}.asf or a single .asf in {path.parent}; "
+                f"there is {found}"
+            )
+        s = amc.read_asf(skeleton[0]) if skeleton else None
+        return s, amc.read_amc(path, s)
+    except amc.AmcError as e:
+        raise UserError(str(e)) from None
+    except OSError as e:
+        raise UserError(f"{path}: {e.strerror or e}; expected an .amc file") from None
+
+
+def _is_amc(path) -> bool:
+    return Path(path).suffix.lower() == ".amc"
 
 
 def resample(clip: Clip, rate: float) -> Clip:
@@ -655,17 +789,20 @@ def _join(parts, blend, name):
 
 # ------------------------------------------------------------------------------------ data sets
 
-SPLITS = ("train", "validation", "style", "all")
+SPLITS = ("train", "validation", "style", "body", "all")
 
 
 def split_of(name: str) -> str:
     """Which part of a data set a clip belongs to: by its name only, so that no run can see a held-out clip by accident.
 
+    body        : NAME.amc (unseen bodies)
     style       : the whole style `youthful` (unseen style)
     validation  : every clip whose trailing number ends in 5 (unseen clips; in LaFAN1 that is subject 5)
     train       : the rest
-    Test        tests/test_mocap.py::test_split
+    Test        tests/test_mocap.py::test_split, tests/test_amc.py::test_body_split
     """
+    if _is_amc(name):
+        return "body"
     if "youthful" in name:
         return "style"
     number = re.search(r"(\d+)$", name)
@@ -674,49 +811,63 @@ def split_of(name: str) -> str:
 
 def builtin_clips(rate=CONTROL_RATE, seed=0) -> list[Clip]:
     """The procedural human of gait.py: the data set that needs no download.  Test: test_mocap.py::test_builtin."""
-    return [
-        Clip(f"{m['name']}_{i:03d}", f"builtin_{i:03d}", m["rate"], m["pos"], m["quat"], m["ball"])
-        for i, m in enumerate(gait.library(rate=rate, seed=seed))
-    ]
+    out = []
+    library = gait.library(rate=rate, seed=seed)
+    for i, m in enumerate(library):
+        number = (i + 5) % len(library)  # so that the two clips held out, 005 and 015, are straight walks
+        name = f"{m['name'].split('_')[1]}_{number:03d}"
+        out.append(Clip(name, f"builtin-{number:03d}", m["rate"], m["pos"], m["quat"], m["ball"]))
+    return out
 
 
 def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all") -> list[Clip]:
     """Single clips of a data set, at one rate.
 
-    Args      motion : "builtin", a BVH file, or a folder of them (searched below); clips : shell pattern on the names
-              split : train | validation | style | all.  A folder of fewer than ten files none of whose names is in the
-              split is used whole, and says so
+    Args      motion : "builtin", a .bvh or .amc file, or a folder of them (searched below)
+              clips : shell pattern on the names
+              split : train | validation | style | body | all.  A folder of fewer than ten files none of whose names is
+              in the split is used whole, and says so.  .amc clips are in `body` alone, unless motion holds nothing
+              else: then it is meant, its clips are also split by their numbers, and it says so
     Raises    UserError: nothing there, a malformed file, or nothing matches; names what would have been valid
-    Test      tests/test_mocap.py::test_split, ::test_load_errors, ::test_bandai_loads_in_seconds
+    Test      tests/test_mocap.py::test_split, ::test_load_errors, ::test_bandai_loads_in_seconds,
+              tests/test_amc.py::test_body_split
     """
     if split not in SPLITS:
         raise UserError(f"split {split!r} is unknown; valid: {', '.join(SPLITS)}")
     if motion == "builtin":
-        items = {c.name: c for c in builtin_clips(rate)}.items()
+        items = [(c.name, c.name, c) for c in builtin_clips(rate)]
     else:
         path = Path(motion)
         if not path.exists():
-            raise UserError(f"{motion}: no such file or folder; valid: builtin, a .bvh file, or a folder of them")
-        files = sorted(f for f in path.rglob("*") if f.suffix.lower() == ".bvh") if path.is_dir() else [path]
+            raise UserError(f"{motion}: no such file or folder; valid: builtin, a .bvh or .amc file, a folder of them")
+        files = sorted(f for f in path.rglob("*") if f.suffix.lower() in (".bvh", ".amc")) if path.is_dir() else [path]
         if not files:
-            raise UserError(f"{motion}: holds no .bvh file")
-        items = [(f.stem, f) for f in files]
-    matching = [(name, item) for name, item in items if fnmatchcase(name, clips)]
-    chosen = [item for name, item in matching if split in ("all", split_of(name))]
+            raise UserError(f"{motion}: holds no .bvh file and no .amc file")
+        meant = all(map(_is_amc, files)) and split not in ("body", "all")
+        if meant:
+            print(f"{motion}: only .amc files, else held out as unseen bodies; split by their numbers", file=sys.stderr)
+        items = [(f.stem, f.name if _is_amc(f) and not meant else f.stem, f) for f in files]
+    matching = [(name, split_of(key), item) for name, key, item in items if fnmatchcase(name, clips)]
+    chosen = [item for _, part, item in matching if split in ("all", part)]
+    bodies = sum(part == "body" for _, part, _ in matching)
+    if split == "train" and bodies:
+        print(f"{motion}: {bodies} .amc clips left out: unseen bodies, split body", file=sys.stderr)
     if not matching:
-        names = [name for name, _ in items]
+        names = [name for name, _, _ in items]
         more = f", … ({len(names)})" if len(names) > 6 else ""
         raise UserError(f"{motion}: no clip matches {clips!r}; there are {', '.join(names[:6])}{more}")
-    if not chosen and motion != "builtin" and len(files) < 10 and split != "style":
+    if not chosen and motion != "builtin" and len(files) < 10 and split not in ("style", "body") and not bodies:
         print(f"{motion}: only {len(files)} clips, none to hold out: {split} uses all of them", file=sys.stderr)
-        chosen = [item for _, item in matching]
+        chosen = [item for _, _, item in matching]
     if not chosen:
-        found = sorted({split_of(name) for name, _ in matching})
+        found = sorted({part for _, part, _ in matching})
         raise UserError(
             f"{motion}: none of the {len(matching)} clips that match {clips!r} is in split {split!r}; "
             f"they are in {' and '.join(found)}"
         )
-    return chosen if motion == "builtin" else [resample(from_bvh(f), rate) for f in chosen]
+    if motion == "builtin":
+        return chosen
+    return [resample(from_amc(f) if _is_amc(f) else from_bvh(f), rate) for f in chosen]
 
 
 def sequences(
@@ -762,15 +913,19 @@ def inspect(path) -> None:
             print(describe(clip))
         _sequences(clips, f"{path} [all]")
         return
-    b = _read(path)
-    rig = rig_of(b)
-    segment = {joint: s for s, joint in RIGS[rig].joints.items()}
+    if _is_amc(path):
+        clip, b, rig, joints = from_amc(path), _read_amc(path)[0], "cmu", CMU_BONES
+    else:
+        b = _read(path)
+        clip, rig = _canonical(b), rig_of(b)
+        joints = RIGS[rig].joints
+    segment = {joint: s for s, joint in joints.items()}
     print(f"{path}: rig {rig}, {len(b.names)} joints")
     depth = []
     for name, parent in zip(b.names, b.parents):
         depth.append(depth[parent] + 1 if parent >= 0 else 0)
         print(f"  {'  ' * depth[-1]}{name:18s} {segment.get(name, '')}".rstrip())
-    print(describe(_canonical(b)))
+    print(describe(clip))
 
 
 def main(argv=None) -> None:
@@ -780,7 +935,7 @@ def main(argv=None) -> None:
     )
     sub = parser.add_subparsers(dest="command", required=True)
     p = sub.add_parser("inspect", help="print skeleton, rate, length, speed and contacts")
-    p.add_argument("path", help="a .bvh file, or a folder of them")
+    p.add_argument("path", help="a .bvh or .amc file, or a folder of them")
     for each in (parser, p):  # one line, as in runs.cli
         each.error = lambda message: parser.exit(2, f"mocap.py: error: {message} (see --help)\n")
     inspect(parser.parse_args(argv).path)

@@ -216,13 +216,15 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
     """Every metric of spec/metrics over recordings, pooled over their frames.
 
     Frames lived count equally, whichever clip they are in; `completed` and `survival` say how many were lived.
-    Joints are the bodies of the joint map.  Contact and action are measured after steps, so not at the start.
+    Joints are the bodies of the joint map; for positions and jitter the hands too.  The human's own figures are taken
+    before the scaling.  Contact and action are measured after steps, so not at the start.
     Returns   key -> number; NaN where there was nothing to measure (no frame, no step, no metre travelled)
     Test      tests/test_play.py::test_metrics_against_slow_loop, test_metrics_of_kinematic,
               test_metrics_on_known_motion, test_nothing_to_measure
     """
     m, rate = char.model, ref.rate
     bodies = np.array(sorted({b for b, *_ in char.chains}))
+    joints = np.union1d(bodies, m.site_bodyid[char.sensor_sites])
     parents = m.body_parentid
     sip = sip_bodies(char)
     rows, sums = [], {}
@@ -236,21 +238,21 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
         sites = 100 * np.linalg.norm(sim.site_xpos - ref.sensor_pos[f], axis=-1)
         mean_over("head_cm", sites[:, 0])
         mean_over("hands_cm", sites[:, 1:])
-        aligned = lambda k: k.xpos[:, bodies] - k.xpos[:, char.root, None]  # noqa: E731
+        aligned = lambda k: k.xpos[:, joints] - k.xpos[:, char.root, None]  # noqa: E731
         mean_over("joint_pos_cm", 100 * np.linalg.norm(aligned(sim) - aligned(kin), axis=-1))
         mean_over("head_deg", np.degrees(quat_angle(sim.xquat[:, char.head], ref.orientation[f, 1])))
         local = [local_rotations(k.xquat, parents)[:, bodies] for k in (sim, kin)]
         mean_over("joint_rot_deg", np.degrees(quat_angle(*local)))
         mean_over("sip_deg", np.degrees(quat_angle(sim.xquat[:, sip], kin.xquat[:, sip])))
-        height, speed = sole_motion(sim.soles, rate)
+        _, speed = sole_motion(sim.soles, rate)
         mean_over("foot_slide_cm_s", 100 * speed[ref.contact[f]] if len(f) > 1 else [])
-        lowest = np.minimum(height.min(1), sim.fall_height)
-        mean_over("penetration_mm", -1000 * lowest[lowest < 0])
+        mean_over("penetration_mm", -1000 * sim.lowest[sim.lowest < 0])
         mean_over("contact_agreement", rec.contact[1:] == ref.contact[f[1:]])
-        add("jitter_m_s3", *jitter(sim.xpos[:, bodies], rate))
-        add("human_jitter_m_s3", *jitter(ref.human_pos[f].astype(float), rate))
+        add("jitter_m_s3", *jitter(sim.xpos[:, joints], rate))
+        human = ref.human_pos[f].astype(float) / ref.scale[f, None]
+        add("human_jitter_m_s3", *jitter(human, rate))
         add("steps_per_m", footfalls(rec.contact), travelled(rec.qpos))
-        add("human_steps_per_m", footfalls(ref.contact[f]), travelled(ref.human_pos[f, 0]))
+        add("human_steps_per_m", footfalls(ref.contact[f]), travelled(human[:, 0]))
         wobble = head_rates(sim.xquat[:, char.head], rate) - head_rates(ref.orientation[f, 1], rate)
         mean_over("head_wobble_deg_s", np.degrees(wobble) ** 2 if len(f) > 2 else [])
         mean_over("torque_rms", rec.action[1:] ** 2)

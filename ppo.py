@@ -11,10 +11,15 @@ One update:  collect `horizon` steps of `envs` characters with the present polic
 from __future__ import annotations
 
 import hashlib
+import os
 import signal
 import time
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+
+# OpenBLAS's idle threads spin for 25 ms before they sleep and take the cores from the physics (design.md, mistake 14).
+# 2^10 cycles is enough; it must be said before NumPy is loaded.
+os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "10")
 
 import numpy as np
 
@@ -56,6 +61,8 @@ from runs import (
     save_checkpoint,
 )
 
+BELOW_ONE = (lambda v: 0 < v < 1, "between 0 and 1")
+
 
 @dataclass
 class Options:
@@ -77,7 +84,7 @@ class Options:
     checkpoint_minutes: float = arg(3.0, "minutes between checkpoints", check=NONNEGATIVE)
     gamma: float = arg(0.97, "discount (QuestSim's)", check=UNIT)
     lam: float = arg(0.95, "lambda of generalised advantage estimation; 1 is Appendix B's return", check=UNIT)
-    clip_eps: float = arg(0.2, "epsilon of the clipped loss", check=POSITIVE)
+    clip_eps: float = arg(0.2, "epsilon of the clipped loss", check=BELOW_ONE)
     epochs: int = arg(4, "passes over the samples per update", check=POSITIVE)
     minibatch: int = arg(2048, "samples per gradient step", check=POSITIVE)
     lr: float = arg(1e-4, "policy's learning rate to start from; adapted to --target-kl", check=POSITIVE)

@@ -459,7 +459,7 @@ class Kinematics:
     velocity: np.ndarray  # (T, nbody, 3) of body origins
     site_xpos: np.ndarray  # (T, 3, 3) headset, controllers
     soles: np.ndarray  # (T, 2, p, 3) end points of the feet's collision shapes, lowered by their radius
-    fall_height: np.ndarray  # (T,) lowest point of the upper body
+    lowest: np.ndarray  # (T,) height of the lowest point of all collision shapes
 
 
 def forward_kinematics(char: Character, qpos, qvel=None, chunk=1024) -> Kinematics:
@@ -488,7 +488,7 @@ def forward_kinematics(char: Character, qpos, qvel=None, chunk=1024) -> Kinemati
             body_velocity(live["cvel"][:k], live["xpos"][:k], live["subtree_com"][:k, char.root]),
             live["site_xpos"][:k, char.sensor_sites],
             sole_points(char, gx, gm),
-            geom_lowest(m, char.fall_geoms, gx, gm).min(1),
+            geom_lowest(m, np.flatnonzero(m.geom_conaffinity), gx, gm).min(1),
         ))  # fmt: skip
     return Kinematics(*(np.concatenate(p) for p in zip(*parts, strict=True)))
 
@@ -621,6 +621,7 @@ class Reference:
     sensor_rot: np.ndarray  # (F, 3, 3, 2) float32
     sensor_quat: np.ndarray  # (F, 3, 4) float64
     human_pos: np.ndarray  # (F, 15, 3) float32
+    scale: np.ndarray  # (F, 3) float32, by which the human's positions were multiplied
     human_rot: np.ndarray  # (F, 15, 3, 2) float32
 
     def __len__(self):
@@ -660,6 +661,7 @@ def _reference_of(char, clip):
         sensor_rot=quat_matrix(sensor_quat)[..., :2].astype(f32),
         sensor_quat=sensor_quat,
         human_pos=(clip.pos * scale).astype(f32),
+        scale=np.tile(scale, (len(clip), 1)).astype(f32),
         human_rot=quat_matrix(clip.quat)[..., :2].astype(f32),
     )
 

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import os
 import re
 import signal
 import struct
@@ -238,16 +239,16 @@ def test_retarget(here, capsys):
     assert run("retarget", "--clips", "0[02]_*") == 0
     out = capsys.readouterr().out
     assert re.search(r"jesse: hips 0\.\d+ m, \d+ hinges, \d+ driven, [\d.]+ kg", out)
-    assert "00_walk_000" in out and "02_stand_002" in out and "mean of 2: slide" in out
+    assert "walk_005" in out and "stand_007" in out and "mean of 2: slide" in out
     assert not list(here.iterdir())
 
 
 def test_ppo(tmp_path):
     """With no option but a folder it trains at once; Ctrl-C ends it with a checkpoint and says how to go on."""
     out, began = tmp_path / "run", time.monotonic()
-    process = subprocess.Popen(
-        [sys.executable, "-u", "ppo.py", "--out", str(out)], cwd=ROOT, stdout=-1, stderr=-1, text=True
-    )
+    env = os.environ | {"OMP_NUM_THREADS": "1"}  # as runs.py advises: on a busy machine BLAS threads only wait
+    command = [sys.executable, "-u", "ppo.py", "--out", str(out)]
+    process = subprocess.Popen(command, cwd=ROOT, env=env, stdout=-1, stderr=-1, text=True)
     guard = threading.Timer(60, process.kill)
     guard.start()
     try:
@@ -263,16 +264,15 @@ def test_ppo(tmp_path):
         process.kill()
     assert waited < 20, f"the first progress line came after {waited:.0f} s"
     assert process.returncode == 0 and "Traceback" not in err, err
-    assert "jesse: " in "".join(lines) and re.search(
-        r"^ +\d\.\d% .*/20.0M steps .* spent, .* left$", lines[-1].rstrip()
-    )
+    assert "jesse: " in "".join(lines) and re.search(r"^ +\d\.\d% .* steps .* spent, .* left$", lines[-1].rstrip())
     assert f"continue with: python ppo.py --resume --out {out}" in rest
     config = json.loads((out / CONFIG).read_text())
     assert config["config"]["character"] == "jesse" and config["config"]["motion"] == "builtin"
     meta = load_checkpoint(out / CHECKPOINT, ("policy.*",))[1]
     metrics = read_metrics(out / METRICS)
     assert meta["updates"] == meta["rows"] == len(metrics["update"]) >= 1
-    assert metrics["steps"][-1] == meta["steps"] == 512 * 32 * meta["updates"]
+    samples = config["config"]["envs"] * config["config"]["horizon"]
+    assert metrics["steps"][-1] == meta["steps"] == samples * meta["updates"]
     assert not list(out.glob("*.tmp-*"))
 
 
@@ -292,7 +292,7 @@ def test_play_png(here, capsys, monkeypatch):
     policy = small_policy(here / "p.npz")
     assert run("play", "--policy", policy, "--png", "sheet.png", "--seconds", 0.5, "--every", 0.25, "--threads", 1) == 0
     out = capsys.readouterr().out
-    assert "sheet.png" in out and re.search(r"02_stand_002: lived 0\.\d s of 0\.6", out)
+    assert "sheet.png" in out and re.search(r"stand_007: lived 0\.\d s of 0\.6", out)
     data = (here / "sheet.png").read_bytes()
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     width, height = struct.unpack(">II", data[16:24])

@@ -701,9 +701,9 @@ def test_load_errors(tmp_path, quick_builtin):
     assert "no such file or folder" in (m := message(tmp_path / "nowhere")) and "builtin" in m and "nowhere" in m
     assert "holds no .bvh file" in message(tmp_path)
     assert all(s in message("builtin", split="test") for s in ("'test'", *mocap.SPLITS))
-    assert "'*fly*'" in (m := message("builtin", clips="*fly*")) and "00_walk" in m and "(20)" in m
-    m = message("builtin", clips="*walk*", split="validation")
-    assert "'*walk*'" in m and "'validation'" in m and "train" in m
+    assert "'*fly*'" in (m := message("builtin", clips="*fly*")) and "walk_005" in m and "(20)" in m
+    m = message("builtin", clips="*jog*", split="validation")
+    assert "'*jog*'" in m and "'validation'" in m and "train" in m
     write_as(tmp_path / "walk_001.bvh", "bandai", still(2))
     (tmp_path / "UPPER.BVH").write_text((tmp_path / "walk_001.bvh").read_text())  # other systems' spelling
     assert [c.name for c in mocap.load(tmp_path)] == ["UPPER", "walk_001"]
@@ -726,7 +726,7 @@ def test_builtin(library):
     assert a[0].pos.tobytes() != c[0].pos.tobytes()
     assert sum(x.seconds for x in a) == pytest.approx(600, abs=0.1)
     assert len({x.body for x in a}) == len({x.name for x in a}) == len(a)
-    kinds = {x.name.split("_")[1] for x in a}
+    kinds = {x.name.split("_")[0] for x in a}
     assert kinds == set(gait.KINDS)
     for x in a:
         body = gait.body_of({"pos": x.pos})
@@ -777,3 +777,73 @@ def test_one_and_two_frames(tmp_path, frames, capsys):
     mocap.main(["inspect", str(path)])
     assert f"{frames} frames" in capsys.readouterr().out
     assert len(mocap.sequences(tmp_path)) == 1
+
+
+# ---------------------------------------------------------------- other users, other gaits
+
+
+def test_mirror():
+    clip = walk(seed=5, turn_rate=0.4)
+    m = mocap.mirror(clip)
+    flip = np.diag([1.0, -1.0, 1.0])
+    for name, i in SEG.items():  # one segment at a time, with matrices
+        other = {"_l": "_r", "_r": "_l"}.get(name[-2:])
+        j = SEG[name[:-2] + other] if other else i
+        np.testing.assert_allclose(m.pos[:, i], clip.pos[:, j] @ flip, atol=1e-12)
+        expected = flip @ rot(clip.quat[:, j]).as_matrix() @ flip
+        np.testing.assert_allclose(rot(m.quat[:, i]).as_matrix(), expected, atol=1e-12)
+    np.testing.assert_allclose(m.ball[:, 0], clip.ball[:, 1] @ flip, atol=1e-12)
+    np.testing.assert_array_equal(mocap.contacts(m), mocap.contacts(clip)[:, ::-1])
+    np.testing.assert_allclose(mocap.heading(m.quat[:, 0]), -mocap.heading(clip.quat[:, 0]), atol=1e-9)
+    again = mocap.mirror(m)
+    np.testing.assert_array_equal(again.pos, clip.pos)
+    np.testing.assert_array_equal(again.quat, clip.quat)
+
+
+@pytest.mark.parametrize("speed", [0.85, 1.0, 1.15])
+def test_warp(speed):
+    clip = walk(seed=6)
+    w = mocap.warp(clip, speed)
+    assert w.rate == clip.rate and abs(w.seconds - clip.seconds / speed) < 2 / clip.rate
+    t = np.arange(len(w)) * speed  # frames of the clip, between which SciPy interpolates
+    for i in (0, SEG["foot_l"], SEG["hand_r"]):
+        np.testing.assert_allclose(
+            w.pos[:, i],
+            np.stack([np.interp(t, np.arange(len(clip)), clip.pos[:, i, a]) for a in range(3)], 1),
+            atol=1e-9,
+        )
+        expected = Slerp(np.arange(len(clip)), rot(clip.quat[:, i]))(np.minimum(t, len(clip) - 1))
+        assert (rot(w.quat[:, i]) * expected.inv()).magnitude().max() < 1e-6
+
+
+def test_resize():
+    clip = walk(seed=7)
+    r = mocap.resize(clip, 1.2, 0.8)
+    np.testing.assert_array_equal(r.quat, clip.quat)
+    for a, b, factor in [
+        ("pelvis", "chest", 1.2),
+        ("thigh_l", "shin_l", 1.2),
+        ("chest", "upper_arm_r", 1.2),
+        ("upper_arm_r", "forearm_r", 0.96),
+        ("forearm_l", "hand_l", 0.96),
+    ]:
+        assert r.limb(a, b) == pytest.approx(factor * clip.limb(a, b), rel=1e-9)
+    assert r.hip_height == pytest.approx(1.2 * clip.hip_height)
+    np.testing.assert_allclose(r.ball, 1.2 * clip.ball)
+    np.testing.assert_allclose(r.pos[-1, 0] - r.pos[0, 0], 1.2 * (clip.pos[-1, 0] - clip.pos[0, 0]))
+    assert r.body != clip.body and clip.pos is not r.pos
+
+
+def test_augment():
+    clips = [walk(seed=s, name=f"walk_{s}") for s in (8, 9)]
+    a, b = (mocap.augment(clips, np.random.default_rng(3)) for _ in range(2))
+    assert a[:2] == clips and len(a) == 4
+    for x, y in zip(a, b, strict=True):
+        np.testing.assert_array_equal(x.pos, y.pos)
+    for clip, other in zip(clips, a[2:], strict=True):
+        scale = other.limb("thigh_l", "shin_l") / clip.limb("thigh_r", "shin_r")
+        assert 0.8 <= scale <= 1.2 and scale != 1.0
+        assert 0.8 <= other.limb("upper_arm_l", "forearm_l") / clip.limb("upper_arm_r", "forearm_r") / scale <= 1.2
+        assert 0.84 <= clip.seconds / other.seconds <= 1.16
+    plain = mocap.augment(clips, np.random.default_rng(3), speed=0, height=0, arms=0)
+    assert_same(plain[2], mocap.mirror(clips[0]))

@@ -129,6 +129,20 @@ def test_simulate(char, ref):
     np.testing.assert_allclose(only[0].qpos, recordings[1].qpos, atol=1e-9)
 
 
+def test_what_happens_after_the_end_does_not_count(char, ref):
+    """Sequences of other lengths go on beside one that is complete; it may fall then."""
+
+    def fall_later(env):
+        action = cheat(env)
+        if env.steps[0] > 32:
+            env.qpos[2, 0] += 5.0
+        return action
+
+    first, second, third = play.simulate(char, ref, fall_later, threads=1)
+    assert not (first.failed or second.failed or third.failed)
+    assert [len(r.frames) for r in (first, second, third)] == [40, 90, 30]
+
+
 def test_simulate_stops_at_500_steps(char, long):
     assert len(long) > 600
     (rec,) = play.simulate(char, long, cheat, threads=1)
@@ -181,6 +195,7 @@ def test_metrics_against_slow_loop(char, ref):
     m, rate = char.model, 30.0
     sim, kin = mujoco.MjData(m), mujoco.MjData(m)
     bodies = [m.body(n).id for n in char.spec["map"]]
+    joints = sorted({*bodies, m.body("hand_l").id, m.body("hand_r").id})
     sip = [m.body(f"{part}_{side}").id for part in ("upper_arm", "thigh") for side in "lr"]
     s = {k: [] for k in KEYS}
     walked, human_walked, falls, human_falls = 0.0, 0.0, 0, 0
@@ -194,21 +209,22 @@ def test_metrics_against_slow_loop(char, ref):
             gaps = [100 * np.linalg.norm(sim.site_xpos[char.sensor_sites[i]] - ref.sensor_pos[f, i]) for i in range(3)]
             s["head_cm"].append(gaps[0])
             s["hands_cm"] += gaps[1:]
-            for b in bodies:
+            for b in joints:
                 off = (sim.xpos[b] - sim.xpos[char.root]) - (kin.xpos[b] - kin.xpos[char.root])
                 s["joint_pos_cm"].append(100 * np.linalg.norm(off))
+            for b in bodies:
                 p = m.body_parentid[b]
                 local = [d.xmat[p].reshape(3, 3).T @ d.xmat[b].reshape(3, 3) for d in (sim, kin)]
                 s["joint_rot_deg"].append(angle(*local))
             s["sip_deg"] += [angle(sim.xmat[b].reshape(3, 3), kin.xmat[b].reshape(3, 3)) for b in sip]
             s["head_deg"].append(angle(sim.xmat[char.head].reshape(3, 3), matrix(ref.orientation[f, 1])))
-            places.append([sim.xpos[b].copy() for b in bodies])
+            places.append([sim.xpos[b].copy() for b in joints])
             heads.append(sim.xmat[char.head].reshape(3, 3).copy())
             human_heads.append(matrix(ref.orientation[f, 1]))
             points = retarget.sole_points(char, sim.geom_xpos[None], sim.geom_xmat[None])[0]  # (2, p, 3)
             soles.append(points)
-            upper = retarget.geom_lowest(m, char.fall_geoms, sim.geom_xpos[None], sim.geom_xmat[None]).min()
-            low = min(points[..., 2].min(), upper)
+            body_geoms = [g for g in range(m.ngeom) if m.geom(g).name != "floor"]
+            low = retarget.geom_lowest(m, body_geoms, sim.geom_xpos[None], sim.geom_xmat[None]).min()
             if low < 0:
                 s["penetration_mm"].append(-1000 * low)
             if k:
@@ -216,7 +232,7 @@ def test_metrics_against_slow_loop(char, ref):
                 s["torque_rms"] += list(rec.action[k] ** 2)
                 s["saturation"] += [float(abs(a) > 0.99) for a in rec.action[k]]
                 walked += np.hypot(*(rec.qpos[k] - rec.qpos[k - 1])[:2])
-                human_walked += np.hypot(*(ref.human_pos[f, 0] - ref.human_pos[f - 1, 0])[:2].astype(float))
+                human_walked += np.hypot(*(ref.human_pos[f, 0] - ref.human_pos[f - 1, 0])[:2] / ref.scale[f, :2])
                 falls += sum(rec.contact[k, i] and not rec.contact[k - 1, i] for i in range(2))
                 human_falls += sum(ref.contact[f, i] and not ref.contact[f - 1, i] for i in range(2))
         last = len(rec.frames) - 1
@@ -236,7 +252,7 @@ def test_metrics_against_slow_loop(char, ref):
                 scale = theta / (2 * np.sin(theta)) if theta > 1e-7 else 0.5
                 both.append(np.degrees(vector * scale * rate / (b - a)))
             s["head_wobble_deg_s"] += [(both[0] - both[1])[0] ** 2, (both[0] - both[1])[2] ** 2]
-        x, h = np.array(places), ref.human_pos[rec.frames].astype(float)
+        x, h = np.array(places), ref.human_pos[rec.frames].astype(float) / ref.scale[rec.frames][:, None]
         for k in range(len(x) - 3):
             third = lambda v: np.linalg.norm(v[k + 3] - 3 * v[k + 2] + 3 * v[k + 1] - v[k], axis=-1) * rate**3  # noqa
             s["jitter_m_s3"] += list(third(x))
@@ -271,6 +287,11 @@ def test_metrics_of_kinematic(char, ref):
                 low = soles[t, foot, :, 2].argmin()
                 speed = np.hypot(*(soles[t + 1, foot, low] - soles[t - 1, foot, low])[:2]) * 15.0
                 assert rec.contact[t, foot] == (soles[t, foot, low, 2] < 0.02 and speed < 0.4)
+
+    lifted = ref.qpos.copy()
+    lifted[:, 2] += 0.05
+    assert any(r.contact.any() for r in recordings)
+    assert not any(r.contact.any() for r in play.kinematic(char, replace(ref, qpos=lifted)))
 
 
 def test_metrics_on_known_motion(char, ref):

@@ -292,7 +292,8 @@ def test_bootstrap_is_before_the_reset(char, ref):
     assert t.reward[0, 2] < t.reward[0, [0, 1, 3, 4, 5]].min() - 4.0  # the −5
 
 
-def test_non_finite_state_does_not_reach_the_networks(char, ref):
+def test_non_finite_state_does_not_reach_the_networks(char, ref, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings into the current folder
     t = trainer_of(char, ref)
     step, calls = t.env.step, itertools.count()
 

@@ -1,0 +1,43 @@
+"""bench.py: the figures exist, are rates, and the parts cost less than the whole."""
+
+import json
+
+import mujoco
+import numpy as np
+
+import bench
+import mocap
+import retarget
+from env import Env
+
+
+def test_bench_json(tmp_path, capsys):
+    out = tmp_path / "bench.json"
+    bench.main(["--character", "jesse", "--envs", "16", "--rounds", "3", "--json", str(out)])
+    r = json.loads(out.read_text())["characters"]["jesse"]
+    needed = "physics environment inference update train policy_step_ms_p50 policy_step_ms_p99 peak_mb".split()
+    assert all(r[k] > 0 for k in needed)
+    # one control step of training is one of each part, so it cannot be faster than the slowest of them
+    assert r["train"] < min(r["environment"], r["inference"], r["update"])
+    assert r["policy_step_ms_p50"] <= r["policy_step_ms_p99"]
+    printed = capsys.readouterr().out
+    assert f"{r['physics']:,.0f}" in printed and "policy step" in printed
+
+
+def test_physics_is_the_same_physics():
+    """`mujoco.rollout` from a reference state arrives where `Env.step` does."""
+    char = retarget.character("jesse")
+    clips = [c for c in mocap.builtin_clips() if c.name.startswith("walk")][:1]
+    env = Env(char, retarget.reference(char, clips), 4, threads=1)
+    physics = bench.Physics(env, np.random.default_rng(0))
+    physics.step()
+    frames = np.random.default_rng(0).choice(env.starts, 4)
+    env.reset(frames=frames)
+    rng = np.random.default_rng(0)
+    rng.choice(env.starts, 4)
+    env.step(0.13 * rng.standard_normal((4, 1, env.action_size))[:, 0])
+    nq = char.model.nq
+    start = mujoco.mj_stateSize(char.model, mujoco.mjtState.mjSTATE_TIME.value)
+    alive = env.steps > 0
+    assert alive.any()
+    np.testing.assert_allclose(physics.state[alive, start : start + nq], env.qpos[alive], atol=1e-9)
