@@ -39,7 +39,7 @@ class Options:
     """What to time, and how often."""
 
     character: str | None = arg(None, "one character; all of them by default")
-    motion: str = arg("builtin", "builtin, a .bvh file, or a folder of them")
+    motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names")
     envs: int = arg(512, "characters simulated side by side", check=POSITIVE)
     threads: int = arg(0, "physics threads, 0 = all cores", check=NONNEGATIVE)

@@ -31,7 +31,7 @@ class Options:
     """Which policy, on which motion, and what to make of it."""
 
     character: str = arg("jesse", "name in characters/, or path of a .toml")
-    motion: str = arg("builtin", "builtin, a .bvh file, or a folder of them")
+    motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names")
     policy: str | None = arg(None, "run folder or policy .npz; characters/NAME.npz by default")
     measure: bool = arg(False, "print every metric for policy, kinematic, zero and pd")
@@ -39,9 +39,10 @@ class Options:
     all: bool = arg(False, "every sequence of the motion, not only its validation part")
     split: str = arg(
         "validation",
-        "which part: train, validation (unseen clips), style (unseen style)",
-        choices=("train", "validation", "style"),
+        "which part: train, validation (unseen clips), style (unseen style), body (unseen bodies: .amc files)",
+        choices=("train", "validation", "style", "body"),
     )
+    user_scale: float = arg(1.0, "play the motion by a user this many times as tall", check=POSITIVE)
     random_starts: int = arg(
         256, "characters started at random frames for the time to failure (0: leave it out)", check=NONNEGATIVE
     )
@@ -497,6 +498,8 @@ def main(argv=None):
     char = retarget.character(opt.character)
     policy, path = find_policy(opt)
     clips = mocap.sequences(opt.motion, "all" if opt.all else opt.split, opt.clips, seed=opt.seed)
+    if opt.user_scale != 1.0:
+        clips = [mocap.resize(c, opt.user_scale) for c in clips]
     if opt.sequence >= len(clips):
         raise UserError(f"--sequence {opt.sequence}: there are {len(clips)}, from 0")
     ref = retarget.reference(char, clips)

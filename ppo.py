@@ -3,6 +3,7 @@ r"""Proximal policy optimisation, every gradient by hand  [Reda23 §3.1, §3.7, 
     python ppo.py --character jesse                                    learn on the built-in motions
     python ppo.py --character jesse --motion FOLDER --out runs/a       learn on motion capture
     python ppo.py --resume --out runs/a --steps 20e6                   continue exactly where it stopped
+    python ppo.py --ship characters/jesse.npz --out runs/a             write the policy of a run, without the rest
 
 One update:  collect `horizon` steps of `envs` characters with the present policy  ->  values, advantages (gae)  ->
 `epochs` passes over the samples in minibatches of the clipped loss (policy) and the squared error (value).
@@ -51,6 +52,7 @@ from runs import (
     arg,
     cli,
     fmt_count,
+    git_state,
     latest_checkpoint,
     load_checkpoint,
     open_run,
@@ -59,6 +61,7 @@ from runs import (
     rng_state,
     run_main,
     save_checkpoint,
+    versions,
 )
 
 BELOW_ONE = (lambda v: 0 < v < 1, "between 0 and 1")
@@ -71,7 +74,7 @@ class Options:
     Table 3 of the paper (its hyper-parameters) is lost: these are ASSUMED, from measured runs."""
 
     character: str = arg("jesse", "name in characters/, or path of a .toml")
-    motion: str = arg("builtin", "builtin, a .bvh file, or a folder of them")
+    motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names, such as '*walk*'")
     steps: int = arg(20_000_000, "control steps to train", check=POSITIVE)
     envs: int = arg(512, "characters simulated side by side", check=POSITIVE)
@@ -79,6 +82,7 @@ class Options:
     seed: int = arg(0, "seed of everything random", check=NONNEGATIVE)
     out: str | None = arg(None, "run folder; runs/CHARACTER by default")
     resume: bool = arg(False, "continue the run in --out exactly")
+    ship: str | None = arg(None, "write the policy of the run in --out to this .npz, and train nothing")
     init: str | None = arg(None, "start from the weights of a policy (.npz) or a run folder")
     threads: int = arg(0, "physics threads, 0 = all cores", check=NONNEGATIVE)
     checkpoint_minutes: float = arg(3.0, "minutes between checkpoints", check=NONNEGATIVE)
@@ -281,6 +285,27 @@ def load_policy(path) -> tuple[Policy, dict]:
         raise UserError(f"{path}: not a policy ({e}); valid: a checkpoint that ppo.py wrote") from None
     policy.norm.frozen = True
     return policy, meta
+
+
+def ship(run, path) -> dict:
+    """Write a run's policy for others to play: weights, normaliser, how it was trained, its data's licence.
+
+    Returns   what was written beside the weights
+    Raises    UserError: the run has no checkpoint, or the path cannot be written
+    Test      tests/test_ppo.py::test_ship
+    """
+    policy, meta = load_policy(run)
+    motion = meta["options"]["motion"]
+    notes = sorted(Path(motion).glob("LICENSE*")) if Path(motion).is_dir() else []
+    title = (
+        notes[0].read_text(errors="replace").strip().split("\n")[0] if notes else "no licence file beside the motion"
+    )
+    kept = {k: meta[k] for k in ("policy", "steps", "data")}
+    kept["options"] = meta["options"] | {"motion": Path(motion).name, "out": None, "init": meta["options"]["init"]}
+    licence = "MIT" if motion == "builtin" else f"weights trained on {Path(motion).name}, licensed: {title}"
+    kept |= {"licence": licence, "versions": versions(), "git": git_state()}
+    save_checkpoint(path, policy.arrays(), kept)
+    return kept
 
 
 def check_fits(policy: Policy, env: Env, path):
@@ -624,6 +649,10 @@ def main(argv=None):
     """python ppo.py: train, or resume.  Test: tests/test_cli.py::test_ppo"""
     opt = cli(Options, argv, "ppo.py", __doc__)
     opt = replace(opt, out=opt.out or f"runs/{Path(opt.character).stem}")
+    if opt.ship:
+        meta = ship(opt.out, opt.ship)
+        print(f"{opt.ship}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}; {meta['licence']}")
+        return
     if opt.resume:
         opt = resumed_options(opt, argv)
     train(opt)

@@ -714,7 +714,7 @@ class Options:
     """What `python retarget.py` can be told."""
 
     character: str = arg("jesse", "name in characters/, or path of a .toml")
-    motion: str = arg("builtin", "builtin, a .bvh file, or a folder of them")
+    motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names")
     png: str | None = arg(None, "write a contact sheet of the first clip, human and character side by side")
     video: str | None = arg(None, "write a video of the first clip (.mp4; needs the extra `view`)")

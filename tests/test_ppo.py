@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import json
 import signal
 import subprocess
 import sys
@@ -658,3 +659,23 @@ def test_config_tells_what_was_run(whole):
     config = ppo.read_config(whole)
     assert config["config"]["clips"] == "*stand*" and config["config"]["data"]["sequences"] == 1
     assert (whole / CONFIG).exists() and {"python", "mujoco"} <= set(config["versions"])
+
+
+def test_ship(tmp_path, monkeypatch):
+    """A shipped policy acts as the run's does, is small, and carries its data's licence."""
+    folder = tmp_path / "motion"
+    folder.mkdir()
+    (folder / "LICENSE").write_text("Non-commercial.\n")
+    monkeypatch.setattr(mocap, "sequences", lambda *a, **k: mocap.builtin_clips()[:1])
+    size = ["--envs", "4", "--horizon", "4", "--steps", "16", "--minibatch", "16"]
+    ppo.main(["--motion", str(folder), "--out", str(tmp_path / "run"), *size])
+    target = tmp_path / "jesse.npz"
+    ppo.main(["--ship", str(target), "--out", str(tmp_path / "run")])
+    (a, _), (b, meta) = ppo.load_policy(tmp_path / "run"), ppo.load_policy(target)
+    obs = np.random.default_rng(0).standard_normal((3, a.obs_size)).astype(np.float32)
+    np.testing.assert_array_equal(a.mean_action(obs), b.mean_action(obs))
+    assert meta["licence"] == "weights trained on motion, licensed: Non-commercial." and meta["steps"] == 16
+    assert target.stat().st_size < 4e6
+    assert str(tmp_path) not in json.dumps(meta)  # no path of the machine
+    with pytest.raises(UserError):
+        ppo.ship(tmp_path / "nothing", target)
