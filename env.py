@@ -240,6 +240,7 @@ class Env:
     n         : number of environments
     threads   : physics threads, 0 = all cores; results do not depend on it
     horizon   : control steps to truncation
+    disturbance, balance : `Disturbance`, `_draw`
     autoreset : start anew where an episode ended; without it the caller resets, and reads the state that ended
     """
 
@@ -256,6 +257,7 @@ class Env:
         substeps=SUBSTEPS,
         autoreset=True,
         disturbance=Disturbance(),  # noqa: B008, it is frozen
+        balance=False,
     ):
         self.char, self.ref, self.n, self.horizon, self.substeps = char, ref, n, horizon, substeps
         self.disturbance = disturbance
@@ -291,6 +293,11 @@ class Env:
         if not len(self.starts):
             raise UserError(f"{', '.join(ref.names[:3])}: too short; a start needs a sequence of three frames or more")
         self.owner = np.repeat(np.arange(len(ref.first)), ref.last - ref.first + 1)
+        self.balance = balance
+        second = self.starts // round(ref.rate)  # `balance` counts by seconds of the reference
+        _, self.bin_first, self.bin_size = np.unique(second, return_index=True, return_counts=True)
+        self.life = np.full(len(self.bin_first), float(horizon))  # of episodes begun there, control steps
+        self.bin = np.zeros(n, int)  # where each environment began
 
     # ---- reset
 
@@ -315,7 +322,7 @@ class Env:
 
     def _reset(self, ids, frames=None):
         """Reference-state initialisation: a random mocap frame, retargeted, position and velocity."""
-        f = self.rng.choice(self.starts, len(ids)) if frames is None else np.asarray(frames)
+        f = self._draw(ids) if frames is None else np.asarray(frames)
         self.frame[ids], self.sequence[ids], self.steps[ids] = f, self.owner[f], 0
         self.available[ids] = np.minimum(self.horizon, self.ref.last[self.owner[f]] - f)
         self.qpos[ids], self.qvel[ids] = self.ref.qpos[f], self.ref.qvel[f]
@@ -323,6 +330,20 @@ class Env:
             self.sensor_error[ids, 0] = self.disturbance.sensor_offset * self.rng.standard_normal((len(ids), 9))
         self.action[ids], self.ctrl[ids], self.warmstart[ids] = 0.0, 0.0, 0.0
         self.batch.forward(ids, STAGE_VEL)
+
+    def _draw(self, ids):
+        r"""Random start frames for the environments ids.
+
+        Equation  uniform over all frames [§3.6]; with `balance` p(second) ∝ frames / mean life of episodes begun there,
+                  so that every second of motion is simulated equally long: where the policy falls it starts often
+        Returns   (len(ids),) frames
+        Test      tests/test_env.py::test_balanced_starts
+        """
+        if not self.balance:
+            return self.rng.choice(self.starts, len(ids))
+        cdf = np.cumsum(self.bin_size / self.life)
+        self.bin[ids] = b = np.searchsorted(cdf, cdf[-1] * self.rng.random(len(ids)), side="right")
+        return self.starts[self.bin_first[b] + (self.bin_size[b] * self.rng.random(len(ids))).astype(int)]
 
     # ---- step
 
@@ -375,6 +396,9 @@ class Env:
         if len(done):
             info["final_critic"] = self.full.copy()
             info["final_obs"] = info["final_critic"][:, : self.obs_size]
+            if self.balance:  # a truncated episode would have lived on
+                lived, b = np.where(terminated, self.steps, self.horizon)[done], self.bin[done]
+                self.life[b] += 0.3 * (lived - self.life[b])
             self._reset(done)
             self._observe(done)
         info["critic"] = self.full
@@ -477,7 +501,9 @@ class Env:
         """Arrays and JSON that `load_state` continues from bit-exactly.
 
         Test      tests/test_env.py::test_state_continues_exactly, tests/test_ppo.py::test_resume_is_exact"""
-        arrays = {k: getattr(self, k).copy() for k in ("frame", "steps", "available", "action", "sensor_error")}
+        arrays = {
+            k: getattr(self, k).copy() for k in ("frame", "steps", "available", "action", "sensor_error", "life", "bin")
+        }
         return {"state": self.batch.state.copy()} | arrays, {"rng": rng_state(self.rng)}
 
     def load_state(self, arrays, meta):
@@ -487,7 +513,7 @@ class Env:
         self.batch.state[:] = arrays["state"]
         self.frame[:], self.steps[:], self.action[:] = arrays["frame"], arrays["steps"], arrays["action"]
         self.available[:] = arrays["available"]
-        self.sensor_error[:] = arrays.get("sensor_error", 0.0)  # older checkpoints have none
+        self.sensor_error[:], self.life[:], self.bin[:] = arrays["sensor_error"], arrays["life"], arrays["bin"]
         self.sequence[:] = self.owner[self.frame]
         self.rng = rng_from_state(meta["rng"])
         self.batch.forward(None, STAGE_VEL)

@@ -99,6 +99,7 @@ class Options:
     value_hidden: tuple[int, ...] = arg((256, 128), "hidden layers of the value network", check=ALL_POSITIVE)
     sigma: float = arg(0.135, "standard deviation of the exploration noise at the start", check=POSITIVE)
     min_sigma: float = arg(0.05, "below this the standard deviations do not fall", check=POSITIVE)
+    balance: bool = arg(False, "start more often where episodes end soon, so that all motion is simulated equally long")
     augment: bool = arg(False, "also mirrored clips at other speeds, by users of other heights and arm lengths")
     sensor_offset: float = arg(0.0, "constant error of device positions in an episode [m]", check=NONNEGATIVE)
     sensor_noise: float = arg(0.0, "white noise on device positions [m]", check=NONNEGATIVE)
@@ -518,7 +519,7 @@ def make_env(opt: Options) -> Env:
         clips = mocap.augment(clips, np.random.default_rng([opt.seed, 3]))
     disturbance = Disturbance(opt.sensor_offset, opt.sensor_noise, opt.push)
     ref = retarget.reference(char, clips)
-    return Env(char, ref, opt.envs, opt.seed, opt.threads, opt.episode, disturbance=disturbance)
+    return Env(char, ref, opt.envs, opt.seed, opt.threads, opt.episode, disturbance=disturbance, balance=opt.balance)
 
 
 CHANGEABLE = ("steps", "threads", "checkpoint_minutes", "resume", "out")

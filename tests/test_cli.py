@@ -68,7 +68,7 @@ def refuse(capsys, folder, script, *args):
 
 
 def small_policy(path, char="jesse"):
-    ref = retarget.reference(retarget.character(char), [mocap.load("builtin", clips="02_*")[0][:10]])
+    ref = retarget.reference(retarget.character(char), [mocap.load("builtin", clips="stand_007")[0][:10]])
     env = Env(retarget.character(char), ref, 1, threads=1)
     policy = Policy(env.obs_size, env.critic_size, env.action_size, (8,), (4,), 0.1, 1.0, np.random.default_rng(0))
     save_checkpoint(path, policy.arrays(), {"policy": policy.shape()})
@@ -183,7 +183,7 @@ def test_no_clip_matches(script, here, capsys):
 
 def test_too_short(here, capsys, monkeypatch):
     """Two frames are a motion, and no place to start from."""
-    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: [mocap.load("builtin", clips="02_*")[0][:2]])
+    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: [mocap.load("builtin", clips="stand_007")[0][:2]])
     assert "three frames" in refuse(capsys, here, "ppo", *TINY, "--out", here / "run")
     policy = small_policy(here / "p.npz")
     assert "three frames" in refuse(capsys, here, "play", "--measure", "--policy", policy)
@@ -288,7 +288,7 @@ def test_ppo_default_folder(here, capsys):
 
 @pytest.mark.skipif(render.gl_backend() is None, reason="no OpenGL: neither egl nor osmesa starts here")
 def test_play_png(here, capsys, monkeypatch):
-    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: [mocap.load("builtin", clips="02_*")[0][:20]])
+    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: [mocap.load("builtin", clips="stand_007")[0][:20]])
     policy = small_policy(here / "p.npz")
     assert run("play", "--policy", policy, "--png", "sheet.png", "--seconds", 0.5, "--every", 0.25, "--threads", 1) == 0
     out = capsys.readouterr().out

@@ -39,13 +39,13 @@ def char():
 
 @pytest.fixture(scope="module")
 def ref(char):
-    walk, stand = (mocap.load("builtin", clips=c)[0] for c in ("00_*", "02_*"))
+    walk, stand = (mocap.load("builtin", clips=c)[0] for c in ("walk_005", "stand_007"))
     return retarget.reference(char, [walk[:40], stand[:90], walk[60:90]])
 
 
 @pytest.fixture(scope="module")
 def long(char):
-    return retarget.reference(char, mocap.load("builtin", clips="02_*"))
+    return retarget.reference(char, mocap.load("builtin", clips="stand_007"))
 
 
 def cheat(env):
@@ -469,7 +469,7 @@ def policy_file(char, ref, tmp_path):
 
 
 def test_measure_json(policy_file, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: [mocap.load("builtin", clips="00_*")[0][:70]])
+    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: [mocap.load("builtin", clips="walk_005")[0][:70]])
     monkeypatch.setattr(play, "time_to_failure", functools.partial(play.time_to_failure, seconds=1.0))
     out = tmp_path / "table.json"
     args = ["--policy", str(policy_file), "--measure", "--json", str(out), "--threads", "1"]
@@ -519,7 +519,7 @@ def test_which_policy(policy_file, tmp_path, monkeypatch, char, ref):
     other = Policy(7, 9, 2, (4,), (4,), 0.1, 1.0, np.random.default_rng(0))
     save_checkpoint(tmp_path / "other.npz", other.arrays(), {"policy": other.shape()})
     monkeypatch.undo()
-    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: mocap.load("builtin", clips="02_*"))
+    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: mocap.load("builtin", clips="stand_007"))
     with pytest.raises(UserError, match="other.npz: a policy of 7 observations and 2 actions; jesse needs"):
         play.main(["--measure", "--policy", str(tmp_path / "other.npz")])
 
