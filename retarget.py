@@ -6,7 +6,7 @@ r"""Characters, and human pose -> character pose  [Reda23 §3.2, §3.4, §3.7].
 
 The kinematic pose slides, floats and sinks: it is a training signal, not a result.
 
-    python retarget.py --character jesse --motion PATH [--png OUT | --video OUT]
+    python retarget.py --character jesse --motion PATH [--png OUT | --video OUT | --bvh OUT]
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from mujoco.batch import Batch
 from scipy.spatial.transform import Rotation
 
+import bvh
 import mocap
 from mocap import (
     SEG,
@@ -33,6 +34,7 @@ from mocap import (
     quat_mul,
     quat_rotate,
 )
+from rigs import HELP, Reading
 from runs import UserError, arg, cli, run_main
 
 CHARACTERS = Path(__file__).resolve().parent / "characters"
@@ -137,7 +139,7 @@ class _Loader:
         names, ranges = self.skeleton()
         default = self.default_pose(names)
         driven, limits = self.torques(names)
-        self.passive(names, driven, limits)
+        self.passive(names, driven)
         chains, mapped = self.chains(names)
         root = self.root()
         feet, soles, contact_adr = self.feet()
@@ -319,18 +321,20 @@ class _Loader:
         m.actuator_gear[:, 0] = limits
         return driven, limits
 
-    def passive(self, names, driven, limits):
-        """Spring and damper of every driven hinge, as multiples of its torque limit, and its armature.
+    def passive(self, names, driven):
+        """Spring, damper (a multiple of the spring) and armature of every driven hinge.
 
         Hinges without a motor (tails, ears) keep what the MJCF gives them."""
         m = self.model
-        k, d = (self.number(f"[passive] {key}", self.get("passive", key, float), 0) for key in ("stiffness", "damping"))
-        armature = self.by_group("passive", "armature", {joint_group(names[h]) for h in driven})
-        for h, limit in zip(driven, limits, strict=True):
+        damping = self.number("[passive] damping", self.get("passive", "damping", float), 0)
+        groups = {joint_group(names[h]) for h in driven}
+        stiffness, armature = (self.by_group("passive", key, groups) for key in ("stiffness", "armature"))
+        for h in driven:
             g = joint_group(names[h])
-            if armature(g) is None:
-                self.fail(f"[passive.armature] has no entry for {g}")
-            m.jnt_stiffness[1 + h], m.dof_damping[6 + h] = k * limit, d * limit
+            for key, value in (("stiffness", stiffness(g)), ("armature", armature(g))):
+                if value is None:
+                    self.fail(f"[passive.{key}] has no entry for {g}")
+            m.jnt_stiffness[1 + h], m.dof_damping[6 + h] = stiffness(g), damping * stiffness(g)
             m.dof_armature[6 + h] = armature(g)
         # MuJoCo scales the softness of contacts and limits by inverse inertias it computed without this armature: again
         mujoco.mj_setConst(m, mujoco.MjData(m))
@@ -706,6 +710,54 @@ def artefacts(char: Character, clip: Clip, pose: Pose) -> dict:
     )
 
 
+# ------------------------------------------------------------------------------------ export
+
+
+def write_bvh(path, char: Character, qpos, rate) -> None:
+    r"""A character's motion as BVH: a joint for each of its bodies.
+
+    Method    rotation of a body in its parent, all its hinges in one; the root also moves.  OFFSETs are the distances
+              of the bodies' origins, End Sites lie as far beyond their last body's centre of mass as that from its origin
+    Frame     y up, z forward, x left, centimetres, as animation tools expect: (x, y, z) of ours is (z, x, y)
+    Args      qpos (T, nq); rate [Hz]
+    Raises    UserError: the file cannot be written, or a body's origin moves in its parent (a hinge beside it)
+    Test      tests/test_retarget.py::test_bvh_round_trip, ::test_bvh_in_another_library
+    """
+    m, fk = char.model, forward_kinematics(char, qpos)
+    bodies = [b for b in range(1, m.nbody) if m.body_rootid[b] == char.root]
+    parents = np.array([bodies.index(m.body_parentid[b]) if b != char.root else -1 for b in bodies])
+    to_file = lambda v: np.roll(v, -1, axis=-1)  # noqa: E731  (x, y, z) -> (y, z, x): left, up, forward
+    local, offsets = fk.xquat[:, bodies], np.zeros((len(bodies), 3))
+    for k, (b, p) in enumerate(zip(bodies, m.body_parentid[bodies])):
+        if b != char.root:
+            back = quat_conj(fk.xquat[:, p])
+            local[:, k] = quat_mul(back, fk.xquat[:, b])
+            offset = quat_rotate(back, fk.xpos[:, b] - fk.xpos[:, p])
+            offsets[k] = offset.mean(axis=0)
+            if np.abs(offset - offsets[k]).max() > 1e-6:
+                raise UserError(
+                    f"{path}: a hinge of {m.body(b).name} lies beside the body's origin: BVH has no such joint"
+                )
+    local = np.concatenate([local[..., :1], to_file(local[..., 1:])], axis=-1)
+    names = [m.body(b).name or f"body{b}" for b in bodies]
+    leaves = {n: 200.0 * to_file(m.body_ipos[b]) for n, b in zip(names, bodies) if b not in m.body_parentid[bodies]}
+    try:
+        bvh.write(
+            path,
+            names,
+            parents,
+            100.0 * to_file(offsets),
+            1.0 / rate,
+            100.0 * to_file(fk.xpos[:, char.root]),
+            local,
+            leaves,
+        )
+    except OSError as e:
+        raise UserError(f"cannot write {path}: {e.strerror or e}; give a folder that exists and is writable") from None
+    except bvh.BvhError as e:
+        raise UserError(str(e)) from None
+
+
 # ------------------------------------------------------------------------------------ command line
 
 
@@ -716,8 +768,12 @@ class Options:
     character: str = arg("jesse", "name in characters/, or path of a .toml")
     motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names")
+    joint_map: str | None = arg(None, HELP["joint_map"])
+    unit: str | None = arg(None, HELP["unit"])
+    up: str | None = arg(None, HELP["up"])
     png: str | None = arg(None, "write a contact sheet of the first clip, human and character side by side")
     video: str | None = arg(None, "write a video of the first clip (.mp4; needs the extra `view`)")
+    bvh: str | None = arg(None, "write the character's kinematic pose in the first clip as BVH")
 
 
 def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360)):
@@ -747,7 +803,7 @@ def main(argv=None):
     Test      tests/test_retarget.py::test_command_line"""
     opt = cli(Options, argv, "retarget.py", __doc__)
     char = character(opt.character)
-    clips = mocap.load(opt.motion, clips=opt.clips)
+    clips = mocap.load(opt.motion, clips=opt.clips, reading=Reading.of(opt))
     print(
         f"{char.name}: hips {char.hip_height:.3f} m, {char.j} hinges, {len(char.limits)} driven, "
         f"{char.model.body_subtreemass[0]:.1f} kg"
@@ -771,10 +827,13 @@ def main(argv=None):
             f"sole in contact {mean['float_mm']:.1f} mm up, "
             f"limits hit {100 * mean['limit_share']:.2f} % of hinge frames"
         )
+    clip, pose = clips[0], retarget(char, clips[0])
+    if opt.bvh:
+        write_bvh(opt.bvh, char, pose.qpos, clip.rate)
+        print(opt.bvh)
     if opt.png or opt.video:
         import render
 
-        clip, pose = clips[0], retarget(char, clips[0])
         if opt.png:
             frames = np.linspace(0, len(clip) - 1, 12).astype(int)
             labels = [f"{t / clip.rate:.1f} s" for t in frames]
@@ -787,4 +846,3 @@ def main(argv=None):
 
 if __name__ == "__main__":
     run_main(main)
-

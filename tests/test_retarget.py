@@ -114,7 +114,7 @@ tail_y = 0.7
 base = { leg = 20.0, default = 4.0 }
 scale = { head = 0.5 }
 [passive]
-stiffness = 2.0
+stiffness = { leg = 40.0, default = 4.0 }
 damping = 0.1
 armature = { leg = 0.01, head = 0.02 }
 [observation]
@@ -160,7 +160,7 @@ def test_character_tables(char, mini):
     }  # fmt: skip
     table4 = {"Shoulder": 0.2, "Elbow": 0.1, "Head": 0.1, "Neck": 0.1} | {f"Spine{i}": 0.25 for i in range(4)}
     assert char.spec["torque"]["scale"] == table4
-    limit = dict(hip=150, knee=150, ankle=90, shoulder=200 * 0.2, elbow=200 * 0.1, head=200 * 0.1, neck=200 * 0.1)
+    limit = dict(hip=200, knee=200, ankle=200, shoulder=200 * 0.2, elbow=200 * 0.1, head=200 * 0.1, neck=200 * 0.1)
     limit |= {f"spine{i}": 400 * 0.25 for i in range(4)}
     want = [limit[n.split("_")[0]] for n in char.hinges]
     np.testing.assert_array_equal(char.driven, np.arange(33))  # every hinge of Jesse has a motor
@@ -188,7 +188,10 @@ def test_torques_and_springs_in_the_model(which, rng, request):
     qpos, qvel = (x[0] for x in random_states(c, rng, 1))
     d = posed(m, qpos, qvel)
     q, v = qpos[7:][c.driven], qvel[6:][c.driven]
-    want = -spec["stiffness"] * c.limits * (q - c.default[c.driven]) - spec["damping"] * c.limits * v
+    table = spec["stiffness"]
+    groups = [c.hinges[h].split("_")[0] for h in c.driven]
+    k = np.array([table.get(g, table.get(g.rstrip("0123"), table.get("default"))) for g in groups])
+    want = -k * (q - c.default[c.driven]) - spec["damping"] * k * v
     np.testing.assert_allclose(d.qfrc_passive[6:][c.driven], want, rtol=1e-9, atol=1e-9)
     for ctrl, force in ((1.0, 1.0), (-0.5, -0.5)):
         d.ctrl[:] = ctrl
@@ -266,17 +269,17 @@ MUTATIONS = [  # what, file, old text, new text, what the one line must say
     ("map share", TOML, "y = 0.25 }", 'y = "half" }', ("[map] spine0.y", "'half'", "number")),
     ("map share axis", TOML, "y = 0.25 }", "z = 0.25 }", ("[map] spine0", "z", "turn about y")),
     ("map no head", TOML, 'to = "head"', 'to = "chest"', ("[map]", "human's head")),
-    ("torque group", TOML, "hip = 150.0", "hop = 150.0", ("[torque.base]", "'hop'", "hip")),
-    ("torque missing", TOML, "hip = 150.0", "", ("[torque.base]", "hip")),
-    ("torque negative", TOML, "hip = 150.0", "hip = -150.0", ("[torque.base] hip", "-150.0")),
-    ("torque zero", TOML, "hip = 150.0", "hip = 0", ("[torque.base]", "positive", "hip")),
-    ("torque type", TOML, "hip = 150.0", 'hip = "strong"', ("[torque.base] hip", "'strong'", "number")),
-    ("torque bool", TOML, "hip = 150.0", "hip = true", ("[torque.base] hip", "True", "number")),
-    ("torque nan", TOML, "hip = 150.0", "hip = nan", ("[torque.base] hip", "nan", "finite")),
+    ("torque group", TOML, "hip = 200.0", "hop = 150.0", ("[torque.base]", "'hop'", "hip")),
+    ("torque missing", TOML, "hip = 200.0", "", ("[torque.base]", "hip")),
+    ("torque negative", TOML, "hip = 200.0", "hip = -150.0", ("[torque.base] hip", "-150.0")),
+    ("torque zero", TOML, "hip = 200.0", "hip = 0", ("[torque.base]", "positive", "hip")),
+    ("torque type", TOML, "hip = 200.0", 'hip = "strong"', ("[torque.base] hip", "'strong'", "number")),
+    ("torque bool", TOML, "hip = 200.0", "hip = true", ("[torque.base] hip", "True", "number")),
+    ("torque nan", TOML, "hip = 200.0", "hip = nan", ("[torque.base] hip", "nan", "finite")),
     ("scale group", TOML, "Elbow = 0.1", "Elbows = 0.1", ("[torque.scale]", "'elbows'", "elbow")),
     ("scale negative", TOML, "Elbow = 0.1", "Elbow = -0.1", ("[torque.scale] Elbow", "-0.1")),
     ("no scale", TOML, "[torque.scale]", "[torque.sale]", ("[torque] has no scale", "base")),
-    ("stiffness", TOML, "stiffness = 1.0", "stiffness = [1.0]", ("[passive] stiffness", "[1.0]", "number")),
+    ("stiffness", TOML, "stiffness = { hip = 150.0, ", "stiffness = { ", ("[passive.stiffness]", "hip")),
     ("damping", TOML, "damping = 0.05", "damping = -0.05", ("[passive] damping", "-0.05")),
     ("armature", TOML, "hip = 0.05, ", "", ("[passive.armature]", "hip")),
     ("armature type", TOML, "hip = 0.05, ", 'hip = "x", ', ("[passive.armature] hip", "'x'")),
