@@ -8,7 +8,7 @@ r"""The environment: N characters, each driven by a headset and two controllers 
     Env          §3.6, §3.7       reset and step as Gymnasium's vector environments have them
 
 After a physics step MuJoCo's positions, velocities and contacts still belong to the state before the last substep;
-`Batch.step(stage=VEL)` recomputes them at the new state (design.md, mistake 4).
+`Batch.step(stage=VEL)` recomputes them at the new state.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from runs import UserError, rng_from_state, rng_state
 ROOT_LIMIT = 0.30  # m  [Reda23 §3.6]; ASSUMED in 3-D
 FORCE_LIMIT = 1.0  # N  [Reda23 App. A]
 EPISODE_STEPS = 500  # [Reda23 §3.6]
-SUBSTEPS = 4  # ASSUMED: 1/120 s physics at 30 Hz control (feasibility: 1/60 s does not learn)
+SUBSTEPS = 4  # ASSUMED: 1/120 s physics at 30 Hz control (a prototype did not learn at 1/60 s)
 FUTURES = (1, 5, 15)  # ASSUMED: future frames shown to the critic, in control steps
 BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
 USER_SIZE = 3 * (3 + 6)
@@ -37,7 +37,7 @@ class HeadingFrame:
     r"""The frame of every observation: on the floor below the root, turned with the root's heading  [Reda23 §3.3].
 
     Equation  p' = R_z(−ψ) (p − (x_root, y_root, 0)),  R' = R_z(−ψ) R
-    Symbols   ψ = `mocap.heading`, of the body's left axis: does not flip when it bends over (design.md, mistake 6)
+    Symbols   ψ = `mocap.heading`, of the body's left axis: does not flip when it bends over
     Args      root_pos (N, 3) [m], root_quat (N, 4) w, x, y, z, world
     Test      tests/test_env.py::test_heading_invariance, test_observation_terms
     """
@@ -105,6 +105,26 @@ def observation_terms(char: Character) -> dict:
     actor = dict(q=j, qd=6 + j, x=3 * links, R=6 * links, user_previous=USER_SIZE, user=USER_SIZE)
     critic = dict(human_pos=45, human_rot=90) | {f"human_pos_in_{k}": 45 for k in FUTURES}
     return {"actor": actor, "critic": critic}
+
+
+def observe(sim, ids, before, now, out) -> HeadingFrame:
+    r"""The actor's observation [Reda23 Eq. 2]: o_t = [o_{t,sim}, o_{t-1,user}, o_{t,user}].
+
+    Args      sim : has char, slices, and the bound arrays qpos, qvel, cvel, xpos, xmat: an Env, or `stream.Player`
+              ids : rows of it; before, now : (pos, rot) of the sensors as `observe_user` takes them
+              out (N, at least the actor's size) is filled
+    Returns   the heading frame
+    Test      tests/test_env.py::test_observation_terms, tests/test_stream.py::test_player_observes_as_env
+    """
+    char, s, links = sim.char, sim.slices, sim.char.obs_links
+    qpos, qvel = sim.qpos[ids], sim.qvel[ids]
+    frame = HeadingFrame(qpos[:, :3], qpos[:, 3:7])
+    rot = sim.xmat[ids][:, links].reshape(len(qpos), len(links), 3, 3)[..., :2]
+    rows = out[:, s["q"].start : s["R"].stop]
+    observe_sim(frame, qpos, qvel, sim.cvel[ids][:, char.root, :3], sim.xpos[ids][:, links], rot, rows)
+    observe_user(frame, *before, out[:, s["user_previous"]])
+    observe_user(frame, *now, out[:, s["user"]])
+    return frame
 
 
 # ------------------------------------------------------------------------------------ reward
@@ -364,7 +384,7 @@ class Env:
             raise ValueError(f"action has shape {np.shape(action)}, expected {self.action.shape}")
         if not np.isfinite(action).all():
             raise ValueError(f"action of environment {int(np.argmin(np.isfinite(action).all(1)))} is not finite")
-        a = np.clip(action, -1.0, 1.0)  # only the physics sees clipped actions (design.md, mistake 3)
+        a = np.clip(action, -1.0, 1.0)  # only the physics sees clipped actions
         self._disturb()
         self.ctrl[:] = a
         self.batch.step(nstep=self.substeps, stage=STAGE_VEL)
@@ -418,7 +438,7 @@ class Env:
 
     def _recover(self):
         """Environments whose state is not finite, or that MuJoCo had to reset: put back on the reference, ended as
-        failures, so that nothing non-finite reaches the networks (design.md, mistake 11).  -> (N,) bool
+        failures, so that nothing non-finite reaches the networks.  -> (N,) bool
 
         Test      tests/test_env.py::test_bad_state_ends_alone"""
         bad = ~(np.isfinite(self.qpos).all(1) & np.isfinite(self.qvel).all(1))
@@ -469,19 +489,13 @@ class Env:
 
     def _observe(self, ids):
         """Fill the rows `ids` of self.full (a slice or indices)."""
-        char, ref, f = self.char, self.ref, self.frame[ids]
+        ref, f = self.ref, self.frame[ids]
         n = len(f)
         out = self.full[ids] if not isinstance(ids, slice) else self.full
         s = self.slices
-        links = char.obs_links
-        qpos, qvel = self.qpos[ids], self.qvel[ids]
-        frame = HeadingFrame(qpos[:, :3], qpos[:, 3:7])
-        rot = self.xmat[ids][:, links].reshape(n, len(links), 3, 3)[..., :2]
-        sim = out[:, s["q"].start : s["R"].stop]
-        observe_sim(frame, qpos, qvel, self.cvel[ids][:, char.root, :3], self.xpos[ids][:, links], rot, sim)
         before = np.maximum(f - 1, ref.first[self.sequence[ids]])  # a sequence's first frame has none before it
-        observe_user(frame, ref.sensor_pos[before], ref.sensor_rot[before], out[:, s["user_previous"]])
-        observe_user(frame, ref.sensor_pos[f], ref.sensor_rot[f], out[:, s["user"]])
+        user = [(ref.sensor_pos[k], ref.sensor_rot[k]) for k in (before, f)]
+        frame = observe(self, ids, *user, out)
         if self.disturbance.sensor_offset or self.disturbance.sensor_noise:
             constant, previous, present = np.moveaxis(self.sensor_error[ids], 1, 0)  # in the heading frame
             out[:, s["user_previous"]][:, :9] += constant + previous

@@ -1,7 +1,7 @@
 r"""Human motion: one canonical human, whatever the rig  [Reda23 §3.4, App. A].
 
     read a file ──────► canonical Clip ──► resample ──► stitch ──► sensors, contacts
-    (bvh.py, amc.py)    15 segments        30 Hz        ≥ 30 s     §3.4    App. A
+    (rigs.py)           15 segments        30 Hz        ≥ 30 s     §3.4    App. A
     or gait.py
 
 Everything after the reader speaks of one human only: 15 named segments, each with a joint centre and an
@@ -10,6 +10,7 @@ the arms hanging.  Metres, radians, seconds; quaternions w, x, y, z.
 
     python mocap.py inspect FILE      skeleton, rate, length, speed, contacts
     python mocap.py inspect FOLDER    one line a clip, and what stitching makes of them
+    python mocap.py fetch NAME        download bandai, cmu or lafan1 (fetch.py)
 """
 
 from __future__ import annotations
@@ -19,501 +20,37 @@ import re
 import sys
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from functools import cache
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-import amc
-import bvh
+import fetch
 import gait
+import rigs
+from human import (  # noqa: F401 (some are for those who say mocap.X)
+    CONTACT_HEIGHT,
+    CONTACT_SPEED,
+    FEET,
+    PARENTS,
+    SEG,
+    SEGMENTS,
+    Clip,
+    angular_velocity,
+    heading,
+    linear_velocity,
+    quat_about,
+    quat_angle,
+    quat_conj,
+    quat_continuous,
+    quat_matrix,
+    quat_mul,
+    quat_rotate,
+    quat_slerp,
+)
+from rigs import AS_IT_IS, RIGS, Reading, from_amc, from_bvh, is_amc  # noqa: F401
 from runs import UserError, run_main
 
-SEGMENTS = (
-    "pelvis", "chest", "head",
-    "thigh_l", "shin_l", "foot_l", "thigh_r", "shin_r", "foot_r",
-    "upper_arm_l", "forearm_l", "hand_l", "upper_arm_r", "forearm_r", "hand_r",
-)  # fmt: skip
-PARENTS = (-1, 0, 1, 0, 3, 4, 0, 6, 7, 1, 9, 10, 1, 12, 13)
-SEG = {name: i for i, name in enumerate(SEGMENTS)}
-FEET = (SEG["foot_l"], SEG["foot_r"])
-CONTROL_RATE = 30.0  # Hz, ASSUMED: Table 3 is lost
-
-# ------------------------------------------------------------------------------------ quaternions
-
-
-def quat_mul(a, b):
-    """Hamilton product of quaternions w, x, y, z, (..., 4) each.  Test: test_mocap.py::test_quaternions."""
-    aw, ax, ay, az = np.moveaxis(np.asarray(a), -1, 0)
-    bw, bx, by, bz = np.moveaxis(np.asarray(b), -1, 0)
-    return np.stack([
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ], axis=-1)  # fmt: skip
-
-
-def quat_conj(q):
-    """Inverse of a unit quaternion.  (..., 4) -> (..., 4).  Test: test_mocap.py::test_quaternions."""
-    return np.asarray(q) * np.array([1, -1, -1, -1], dtype=np.asarray(q).dtype)
-
-
-def quat_rotate(q, v):
-    """Rotate vectors v (..., 3) by q = (w, u): v + 2 w (u×v) + 2 u×(u×v).  Test: test_mocap.py::test_quaternions."""
-    q, v = np.asarray(q), np.asarray(v)
-    u, w = q[..., 1:], q[..., :1]
-    t = 2.0 * np.cross(u, v)
-    return v + w * t + np.cross(u, t)
-
-
-def quat_matrix(q):
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4).  Test: test_mocap.py::test_quaternions."""
-    w, x, y, z = np.moveaxis(np.asarray(q), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(r, axis=-1) for r in rows], axis=-2)
-
-
-def quat_about(axis: int, angle):
-    """Turn by `angle` (...) about coordinate axis 0, 1 or 2 -> (..., 4).  Test: test_mocap.py::test_quaternions."""
-    angle = np.asarray(angle, dtype=float)
-    q = np.zeros(angle.shape + (4,))
-    q[..., 0], q[..., 1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
-    return q
-
-
-def quat_angle(a, b):
-    """Geodesic angle |log(a b⁻¹)| in [0, π]; q and −q are one rotation.  Test: test_mocap.py::test_quaternions."""
-    r = quat_mul(a, quat_conj(b))
-    return 2.0 * np.arctan2(np.linalg.norm(r[..., 1:], axis=-1), np.abs(r[..., 0]))
-
-
-def quat_slerp(a, b, t):
-    """Slerp along the shorter arc.  a, b (..., 4), t (...) in [0, 1].  Test: test_mocap.py::test_resample."""
-    dot = np.sum(a * b, axis=-1, keepdims=True)
-    b, dot = np.where(dot < 0, -b, b), np.minimum(np.abs(dot), 1.0)
-    t = np.asarray(t)[..., None]
-    theta = np.arccos(dot)
-    small = theta < 1e-6  # sin θ/θ → 1: linear interpolation is exact to 1e-12 there
-    s = np.where(small, 1.0, np.sin(theta))
-    wa = np.where(small, 1 - t, np.sin((1 - t) * theta) / s)
-    wb = np.where(small, t, np.sin(t * theta) / s)
-    q = wa * a + wb * b
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
-
-
-def quat_continuous(q):
-    """Signs such that consecutive frames lie in one hemisphere.  q (T, ..., 4).  Test: test_mocap.py::test_resample."""
-    flip = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=-1, keepdims=True) < 0, -1.0, 1.0), axis=0)
-    return np.concatenate([q[:1], q[1:] * flip])
-
-
-def angular_velocity(q, rate):
-    r"""World-frame angular velocity by central differences of log(q_{t+1} q_{t-1}⁻¹).
-
-    Equation  ω_t = log(q_{t+1} q_{t−1}^{-1}) / (2 Δt), one-sided at both ends
-    Args      q : (T, ..., 4); rate [Hz]
-    Returns   (T, ..., 3) [rad/s], world frame
-    Test      tests/test_mocap.py::test_velocities
-    """
-    nxt, prv = np.concatenate([q[1:], q[-1:]]), np.concatenate([q[:1], q[:-1]])
-    d = quat_mul(nxt, quat_conj(prv))
-    d = np.where(d[..., :1] < 0, -d, d)
-    s = np.linalg.norm(d[..., 1:], axis=-1, keepdims=True)
-    log = d[..., 1:] * np.where(s < 1e-9, 2.0, 2.0 * np.arctan2(s, d[..., :1]) / np.maximum(s, 1e-12))
-    return log * _span(len(q), rate).reshape((-1,) + (1,) * (q.ndim - 1))
-
-
-def linear_velocity(x, rate):
-    """Central differences of x (T, ...), one-sided at the ends, per second.  Test: test_mocap.py::test_velocities."""
-    nxt, prv = np.concatenate([x[1:], x[-1:]]), np.concatenate([x[:1], x[:-1]])
-    return (nxt - prv) * _span(len(x), rate).reshape((-1,) + (1,) * (x.ndim - 1))
-
-
-def _span(n, rate):
-    if n < 2:
-        return np.zeros(n)
-    s = np.full(n, rate / 2.0)
-    s[[0, -1]] = rate
-    return s
-
-
-def heading(q):
-    r"""Yaw of the heading frame: where the body's LEFT axis says forward is.
-
-    Equation  ψ = atan2(−l_x, l_y), l = q · (0, 1, 0)
-    Why       looking up or bending over turns about the left axis and leaves it alone, so the heading cannot flip;
-              the projected forward axis would (design.md, mistake 6)
-    Args      q : (..., 4) root orientation, world frame
-    Returns   (...) [rad]
-    Test      tests/test_mocap.py::test_heading_does_not_flip
-    """
-    w, x, y, z = np.moveaxis(np.asarray(q), -1, 0)
-    return np.arctan2(-2 * (x * y - w * z), 1 - 2 * (x * x + z * z))
-
-
-# ------------------------------------------------------------------------------------ the canonical human
-
-
-@dataclass(frozen=True)
-class Clip:
-    """A motion of the canonical human.
-
-    name  : where it comes from
-    body  : whose body it is (from a file: rig or subject, and limb lengths); only clips of one body are stitched
-    rate  : frames a second
-    pos   : (T, 15, 3) joint centre at the near end of each segment [m], world; pelvis: midpoint of the hip joints
-    quat  : (T, 15, 4) anatomical frame of each segment -> world
-    ball  : (T, 2, 3) ball of the left and the right foot [m], world
-    """
-
-    name: str
-    body: str
-    rate: float
-    pos: np.ndarray
-    quat: np.ndarray
-    ball: np.ndarray
-
-    def __len__(self):
-        return len(self.pos)
-
-    @property
-    def seconds(self):
-        return len(self.pos) / self.rate
-
-    def __getitem__(self, s: slice) -> Clip:
-        return replace(self, pos=self.pos[s], quat=self.quat[s], ball=self.ball[s])
-
-    def limb(self, a: str, b: str) -> float:
-        """Mean distance between two joint centres [m]."""
-        return float(np.linalg.norm(self.pos[:, SEG[a]] - self.pos[:, SEG[b]], axis=-1).mean())
-
-    @property
-    def hip_height(self) -> float:
-        """Height of the hips when standing straight [m]: thigh + shin + the ankle's lowest height, both legs' mean.
-        The ankle's 5th percentile, because the lowest frame of a real recording is noise."""
-        leg = [self.limb(f"thigh_{s}", f"shin_{s}") + self.limb(f"shin_{s}", f"foot_{s}") for s in "lr"]
-        ankle = np.percentile(self.pos[:, FEET, 2], 5, axis=0)
-        return float(np.mean(leg) + np.mean(ankle))
-
-
-@dataclass(frozen=True)
-class Rig:
-    """How one capture skeleton maps to the canonical human.
-
-    joints : segment -> joint of the file.  pelvis is placed at the midpoint of the thighs' joints
-    axes   : segment -> (forward, left, up) in the joint's own frame when standing, each as "-z" or a vector
-    pitch  : segment -> degrees by which the joint's forward axis points down when standing; taken out
-    balls  : the joints at the balls of the feet, left and right
-    """
-
-    joints: dict
-    axes: dict
-    balls: tuple
-    pitch: dict = field(default_factory=dict)
-    unit: float = 0.01  # file unit in metres
-    signature: tuple = ()
-
-    def calibration(self, segment: str) -> np.ndarray:
-        """Constant rotation anatomical frame -> joint frame (4,).  Test: test_mocap.py::test_rigs_stand_upright."""
-        cols = np.stack([_axis(a) for a in self.axes[segment]], axis=1)  # (3, 3): forward, left, up as columns
-        q = Rotation.from_matrix(cols).as_quat(scalar_first=True)
-        return quat_mul(q, quat_about(1, np.radians(-self.pitch.get(segment, 0.0))))
-
-
-def _axis(a):
-    """ "-z" -> (0, 0, -1); a vector passes through, made unit length."""
-    if isinstance(a, str):
-        v = np.zeros(3)
-        v["xyz".index(a[-1])] = -1.0 if a[0] == "-" else 1.0
-        return v
-    return np.asarray(a, dtype=float) / np.linalg.norm(a)
-
-
-def _frame(left, up):
-    """(forward, left, up) from a left axis made orthogonal to up."""
-    left, up = _axis(left), _axis(up)
-    left = left - up * (left @ up)
-    left /= np.linalg.norm(left)
-    return np.cross(left, up), left, up
-
-
-def _limbs(frames: dict) -> dict:
-    """Spread one frame a limb over its segments, and both sides."""
-    out = {}
-    for limb, (left_side, right_side) in frames.items():
-        for segment in {"leg": ("thigh", "shin"), "arm": ("upper_arm", "forearm", "hand"), "foot": ("foot",)}[limb]:
-            out[f"{segment}_l"], out[f"{segment}_r"] = left_side, right_side
-    return out
-
-
-# Axes were read off standing and walking frames: the bones lie along local x in both rigs, knees and elbows turn about
-# one local axis.  Pitches: the foot's bone slopes down to the ball by this much when the foot is flat; the Bandai head
-# looks down by this much in the mean over `walk_normal`, where people look ahead (ASSUMED).
-RIGS = {
-    "bandai": Rig(
-        signature=("joint_Root", "Hips", "UpperLeg_L", "LowerArm_R"),
-        joints=dict(
-            pelvis="Hips", chest="Chest", head="Head",
-            thigh_l="UpperLeg_L", shin_l="LowerLeg_L", foot_l="Foot_L",
-            thigh_r="UpperLeg_R", shin_r="LowerLeg_R", foot_r="Foot_R",
-            upper_arm_l="UpperArm_L", forearm_l="LowerArm_L", hand_l="Hand_L",
-            upper_arm_r="UpperArm_R", forearm_r="LowerArm_R", hand_r="Hand_R",
-        ),  # fmt: skip
-        balls=("Toes_L", "Toes_R"),
-        axes=dict(
-            pelvis=("z", "-y", "x"),
-            chest=("y", "z", "x"),
-            head=("y", "z", "x"),
-            **_limbs(dict(
-                leg=(("z", "y", "-x"), ("-z", "y", "x")),
-                arm=(("z", "y", "-x"), ("-z", "y", "x")),
-                foot=(("x", "y", "z"), ("-x", "y", "-z")),
-            )),
-        ),
-        pitch=dict(foot_l=39.6, foot_r=39.6, head=12.6),
-    ),
-    "lafan1": Rig(
-        signature=("Hips", "LeftUpLeg", "Spine2", "LeftForeArm", "LeftToe"),
-        joints=dict(
-            pelvis="Hips", chest="Spine2", head="Head",
-            thigh_l="LeftUpLeg", shin_l="LeftLeg", foot_l="LeftFoot",
-            thigh_r="RightUpLeg", shin_r="RightLeg", foot_r="RightFoot",
-            upper_arm_l="LeftArm", forearm_l="LeftForeArm", hand_l="LeftHand",
-            upper_arm_r="RightArm", forearm_r="RightForeArm", hand_r="RightHand",
-        ),  # fmt: skip
-        balls=("LeftToe", "RightToe"),
-        axes=dict(
-            pelvis=("y", "z", "x"),
-            chest=("y", "z", "x"),
-            head=("y", "z", "x"),
-            **_limbs(dict(
-                leg=(("y", "-z", "-x"), ("y", "-z", "-x")),
-                # the elbows' axis in the arms' frames, the mean of upper arm × forearm over the clip
-                arm=(_frame((0, 0.34, 0.94), "-x"), _frame((0, -0.38, 0.92), "-x")),
-                foot=(("x", "-z", "y"), ("x", "-z", "y")),
-            )),
-        ),
-        pitch=dict(foot_l=25.8, foot_r=25.8),
-    ),
-}  # fmt: skip
-
-# y-up file axes (x left, y up, z forward) -> ours: a cyclic permutation, so a proper rotation
-_Y_UP = np.array([0.5, 0.5, 0.5, 0.5])
-
-
-def rig_of(b: bvh.Bvh) -> str:
-    """Name of the rig whose joints the file has.
-
-    Raises    UserError: no rig; names the joints found and the rigs known
-    Test      tests/test_mocap.py::test_unknown_rig
-    """
-    for name, rig in RIGS.items():
-        if set(rig.signature) | set(rig.balls) | set(rig.joints.values()) <= set(b.names):
-            return name
-    raise UserError(
-        f"{b.path}: unknown skeleton with joints {', '.join(b.names)}; known rigs: "
-        + "; ".join(f"{n} ({', '.join(r.signature)}, …)" for n, r in RIGS.items())
-    )
-
-
-def from_bvh(path) -> Clip:
-    """Read a BVH of a known rig as the canonical human, at the file's own rate.
-
-    Symbols   p = u·P(p_file), q = q_yup q_file C: unit u, axes P and q_yup, calibration C of the rig
-    Frame     world, floor at z = 0, metres
-    Raises    UserError: cannot be opened, not a BVH, or an unknown skeleton
-    Test      tests/test_mocap.py::test_bvh_against_scipy, ::test_root_offset
-    """
-    return _canonical(_read(path))
-
-
-def _read(path) -> bvh.Bvh:
-    try:
-        return bvh.read(path)
-    except bvh.BvhError as e:
-        raise UserError(str(e)) from None
-    except OSError as e:
-        raise UserError(f"{path}: {e.strerror or e}; expected a .bvh file") from None
-
-
-def _canonical(b: bvh.Bvh) -> Clip:
-    name = rig_of(b)
-    rig = RIGS[name]
-    pose = _clip_of(b, rig, name, "replace")
-    root = b.parents.argmin()
-    if np.any(b.offsets[root]) and any("position" in c for c in b.channels[root]):
-        # Some exporters add the root's OFFSET to its channels, most do not: right is what puts the feet on the floor.
-        added = _clip_of(b, rig, name, "add")
-        if abs(_lowest(added)) < abs(_lowest(pose)):
-            pose = added
-    return replace(pose, body=_body(name, pose))
-
-
-def _body(rig: str, clip: Clip) -> str:
-    """Whose body: the rig and the lengths of leg and arm [cm], so that two people in one rig are two bodies."""
-    leg = clip.limb("thigh_l", "shin_l") + clip.limb("shin_l", "foot_l")
-    arm = clip.limb("upper_arm_l", "forearm_l") + clip.limb("forearm_l", "hand_l")
-    return f"{rig}-leg{100 * leg:.0f}-arm{100 * arm:.0f}"
-
-
-@cache
-def _calibrations(rig: str) -> np.ndarray:
-    return np.stack([RIGS[rig].calibration(s) for s in SEGMENTS])
-
-
-def _lowest(clip):
-    return np.percentile(clip.ball[..., 2].min(axis=1), 20)
-
-
-def _clip_of(b, rig, name, root_offset):
-    pose = bvh.global_pose(b, root_offset)
-    return _human(rig, _calibrations(name), b.names, *pose, Path(b.path).stem, name, 1.0 / b.frame_time)
-
-
-def _human(rig, calibrations, names, pos, quat, clip, body, rate):
-    """The canonical human in a file's joints (file units, y up)."""
-    index = {n: i for i, n in enumerate(names)}
-    cols = [index[rig.joints[s]] for s in SEGMENTS]
-    p = pos[..., [2, 0, 1]] * rig.unit
-    q = quat_mul(_Y_UP, quat_mul(quat[:, cols], calibrations))
-    joint_pos = p[:, cols].copy()
-    joint_pos[:, 0] = 0.5 * (joint_pos[:, SEG["thigh_l"]] + joint_pos[:, SEG["thigh_r"]])
-    ball = p[:, [index[n] for n in rig.balls]]
-    return Clip(clip, body, rate, joint_pos, quat_continuous(q), ball)
-
-
-# CMU's skeletons: the same bones and zero pose for every subject, lengths and some directions of their own.  The head's
-# joint is where `head` starts: 9 cm below the headband, as in a skull.  The forearm is `radius` and `wrist` together:
-# `wrist` only pronates, and `hand` flexes.  `thorax` starts in the middle of the back.
-CMU_BONES = dict(
-    pelvis="root", chest="thorax", head="head",
-    thigh_l="lfemur", shin_l="ltibia", foot_l="lfoot", thigh_r="rfemur", shin_r="rtibia", foot_r="rfoot",
-    upper_arm_l="lhumerus", forearm_l="lradius", hand_l="lhand",
-    upper_arm_r="rhumerus", forearm_r="rradius", hand_r="rhand",
-)  # fmt: skip
-# Degrees, means over subjects 07, 08, 16, 35.  In straight walks the head looks down by 15 (10 to 18), and people look
-# ahead (ASSUMED).  With ankle and ball both slower than 0.25 m/s the sole, square to the shank in the zero pose, points
-# down by 2.9 (1.9 to 5.0).
-CMU_PITCH = dict(head=15.0, foot_l=2.9, foot_r=2.9)
-INCH = 0.0254  # m; CMU's unit is 1 / (:units length) inches
-AMC_RATE = 120.0  # Hz of CMU's AMC files, which do not say it
-
-
-def cmu_rig(skeleton: amc.Skeleton) -> Rig:
-    r"""The rig of a CMU skeleton, from its zero pose: a T-pose with splayed legs, all bones' frames being the file's.
-
-    Method    up: against the bone (thigh, shin, arm, hand), the file's y (trunk, head), the shin's (foot).
-              left: the knee's axis, with which the shin bends back, for the leg; against the elbow's axis, with which
-              the forearm bends forward, for upper arm and forearm; in the hand the T-pose's palms face down and the
-              thumbs forward, so left is up (left hand) or down.  Knee and elbow turn about x of their `axis`
-    Frame     of the file: x left, y up, z forward
-    Raises    UserError: bones are missing, or a knee or an elbow has no rx; names them
-    Test      tests/test_amc.py::test_zero_pose_is_a_t_pose, ::test_cmu_anatomy, ::test_unknown_skeleton
-    """
-    index = {n: i for i, n in enumerate(skeleton.names)}
-    wanted = {*CMU_BONES.values(), "ltoes", "rtoes"}
-    hinges = {"ltibia", "rtibia", "lradius", "rradius"}
-    missing = sorted(wanted - set(index)) or sorted(n for n in hinges if "rx" not in skeleton.dofs[index[n]])
-    if missing:
-        raise UserError(
-            f"{skeleton.path}: no CMU skeleton: {', '.join(missing)} missing or without rx; "
-            f"it has {', '.join(skeleton.names)}"
-        )
-
-    def hinge(name):
-        i = index[name]
-        return Rotation.from_euler(skeleton.axis_orders[i], skeleton.axes[i]).apply([1.0, 0.0, 0.0])
-
-    axes = dict.fromkeys(("pelvis", "chest", "head"), _frame("x", "y"))
-    for side, palm in (("l", "y"), ("r", "-y")):
-        up = {s: -skeleton.directions[index[side + s]] for s in ("femur", "tibia", "humerus", "radius", "hand")}
-        knee, elbow = hinge(f"{side}tibia"), -hinge(f"{side}radius")
-        axes[f"thigh_{side}"], axes[f"shin_{side}"] = _frame(knee, up["femur"]), _frame(knee, up["tibia"])
-        axes[f"foot_{side}"] = axes[f"shin_{side}"]
-        axes[f"upper_arm_{side}"], axes[f"forearm_{side}"] = _frame(elbow, up["humerus"]), _frame(elbow, up["radius"])
-        axes[f"hand_{side}"] = _frame(palm, up["hand"])
-    return Rig(CMU_BONES, axes, ("ltoes", "rtoes"), CMU_PITCH, INCH / skeleton.length)
-
-
-def from_amc(path, rate=AMC_RATE) -> Clip:
-    """Read a CMU motion as the canonical human; its skeleton lies beside it.
-
-    Symbols   as in `from_bvh`; unit 0.0254 / (:units length) m; the balls of the feet are where the toes start
-    Frame     world, floor at z = 0, metres; made level by `level`
-    Args      path : SUBJECT_TRIAL.amc beside SUBJECT.asf, or beside a single .asf of any name
-              rate : [Hz] of the file, which does not hold it; CMU's are 120
-    Returns   Clip at that rate, body cmu-SUBJECT with lengths of leg and arm
-    Raises    UserError: cannot be opened, malformed, no skeleton beside it, or not CMU's; names what was looked for
-    Test      tests/test_amc.py::test_from_amc_against_matrices, ::test_skeleton_beside, ::test_cmu_anatomy
-    """
-    s, motion = _read_amc(path)
-    rig = cmu_rig(s)
-    calibrations = np.stack([rig.calibration(segment) for segment in SEGMENTS])
-    pose = amc.global_pose(s, motion)
-    clip = level(_human(rig, calibrations, s.names, *pose, Path(path).stem, "", float(rate)))
-    return replace(clip, body=_body(f"cmu-{Path(s.path).stem}", clip))
-
-
-LEVEL_SPREAD, LEVEL_LIMIT = 0.2, 3.0  # m; degrees
-
-
-def level(clip: Clip) -> Clip:
-    r"""The clip turned about the origin so that the floor under its standing feet is level.
-
-    Why       the floor of CMU's subjects 07 and 08 rises by 1.8 to 2.1 cm a metre: 6 cm from end to end of a walk
-    Equation  g = argmin mean_i (h_i − g·x_i)² + s² |g|²; h_i, x_i: height and place of a standing ball, both less that
-              foot's means.  s = 0.2 m: where the feet spread less than that, as across a straight walk, g stays 0.
-              Then a turn by atan |g| about (−g_y, g_x, 0)
-    ASSUMED   the floor is a plane through the capture's origin: there the balls of all four subjects stand 3 to 5 cm
-              high.  More than 3 degrees are stairs or a ramp, which stay
-    Test      tests/test_amc.py::test_level, ::test_cmu_floor
-    """
-    standing = (clip.ball[..., 2] < CONTACT_HEIGHT) & (
-        np.linalg.norm(linear_velocity(clip.ball, clip.rate), axis=-1) < CONTACT_SPEED
-    )
-    feet = [clip.ball[standing[:, k], k] for k in (0, 1) if standing[:, k].any()]
-    if not feet:
-        return clip
-    d = np.concatenate([f - f.mean(axis=0) for f in feet])
-    x, h = d[:, :2], d[:, 2]
-    g = np.linalg.solve(x.T @ x / len(x) + LEVEL_SPREAD**2 * np.eye(2), x.T @ h / len(x))
-    steep = np.linalg.norm(g)
-    angle = np.arctan(steep)
-    if not 0.0 < angle < np.radians(LEVEL_LIMIT):
-        return clip
-    q = np.array([np.cos(angle / 2), *np.sin(angle / 2) / steep * np.array([-g[1], g[0], 0.0])])
-    return replace(clip, pos=quat_rotate(q, clip.pos), ball=quat_rotate(q, clip.ball), quat=quat_mul(q, clip.quat))
-
-
-def _read_amc(path):
-    """Skeleton and motion of an .amc file."""
-    path = Path(path)
-    beside = sorted(f for f in path.parent.glob("*") if f.suffix.lower() == ".asf")
-    subject = path.stem.rpartition("_")[0] or path.stem
-    skeleton = [f for f in beside if f.stem == subject] or beside
-    try:
-        if path.exists() and len(skeleton) != 1:
-            found = ", ".join(f.name for f in beside[:6]) or "none"
-            raise UserError(
-                f"{path}: no skeleton beside it: looked for {subject}.asf or a single .asf in {path.parent}; "
-                f"there is {found}"
-            )
-        s = amc.read_asf(skeleton[0]) if skeleton else None
-        return s, amc.read_amc(path, s)
-    except amc.AmcError as e:
-        raise UserError(str(e)) from None
-    except OSError as e:
-        raise UserError(f"{path}: {e.strerror or e}; expected an .amc file") from None
-
-
-def _is_amc(path) -> bool:
-    return Path(path).suffix.lower() == ".amc"
+CONTROL_RATE = 30.0  # Hz, ASSUMED: Table 3 is not in the text we have
 
 
 def resample(clip: Clip, rate: float) -> Clip:
@@ -611,14 +148,11 @@ def sensors(clip: Clip):
     return clip.pos[:, idx] + quat_rotate(q, np.broadcast_to(SENSOR_OFFSETS, q.shape[:2] + (3,))), q
 
 
-CONTACT_HEIGHT, CONTACT_SPEED = 0.20, 0.40  # m, m/s  [Reda23 App. A]
-
-
 def contacts(clip: Clip) -> np.ndarray:
     r"""Human foot contacts  [Reda23 App. A]: height < 0.20 m above the ground and speed < 0.4 m/s.
 
     ASSUMED   the foot is its ankle OR its ball: from heel strike (ball still moving) to toe-off (heel already up)
-    Returns   (T, 2) bool, left and right; computed on the human, before any scaling (design.md, mistake 10)
+    Returns   (T, 2) bool, left and right; computed on the human, before any scaling
     Test      tests/test_mocap.py::test_contacts
     """
     points = np.stack([clip.pos[:, FEET], clip.ball])  # (2, T, 2, 3): ankle, ball
@@ -801,7 +335,7 @@ def split_of(name: str) -> str:
     train       : the rest
     Test        tests/test_mocap.py::test_split, tests/test_amc.py::test_body_split
     """
-    if _is_amc(name):
+    if is_amc(name):
         return "body"
     if "youthful" in name:
         return "style"
@@ -820,11 +354,11 @@ def builtin_clips(rate=CONTROL_RATE, seed=0) -> list[Clip]:
     return out
 
 
-def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all") -> list[Clip]:
+def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS_IT_IS) -> list[Clip]:
     """Single clips of a data set, at one rate.
 
     Args      motion : "builtin", a .bvh or .amc file, or a folder of them (searched below)
-              clips : shell pattern on the names
+              clips : shell pattern on the names; reading : what the user says about joints, unit and axes of BVH files
               split : train | validation | style | body | all.  A folder of fewer than ten files none of whose names is
               in the split is used whole, and says so.  .amc clips are in `body` alone, unless motion holds nothing
               else: then it is meant, its clips are also split by their numbers, and it says so
@@ -843,10 +377,10 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all") -> list[Cl
         files = sorted(f for f in path.rglob("*") if f.suffix.lower() in (".bvh", ".amc")) if path.is_dir() else [path]
         if not files:
             raise UserError(f"{motion}: holds no .bvh file and no .amc file")
-        meant = all(map(_is_amc, files)) and split not in ("body", "all")
+        meant = all(map(is_amc, files)) and split not in ("body", "all")
         if meant:
             print(f"{motion}: only .amc files, else held out as unseen bodies; split by their numbers", file=sys.stderr)
-        items = [(f.stem, f.name if _is_amc(f) and not meant else f.stem, f) for f in files]
+        items = [(f.stem, f.name if is_amc(f) and not meant else f.stem, f) for f in files]
     matching = [(name, split_of(key), item) for name, key, item in items if fnmatchcase(name, clips)]
     chosen = [item for _, part, item in matching if split in ("all", part)]
     bodies = sum(part == "body" for _, part, _ in matching)
@@ -867,17 +401,23 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all") -> list[Cl
         )
     if motion == "builtin":
         return chosen
-    return [resample(from_amc(f) if _is_amc(f) else from_bvh(f), rate) for f in chosen]
+    return [resample(clip, rate) for clip in rigs.read_clips(chosen, reading, files)]
 
 
 def sequences(
-    motion="builtin", split="train", clips="*", rate=CONTROL_RATE, seed=0, limit=0.15, verbose=True
+    motion="builtin", split="train", clips="*", rate=CONTROL_RATE, seed=0, limit=0.15, verbose=True, reading=AS_IT_IS
 ) -> list[Clip]:
     """Stitched sequences of a data set: what training and measuring use.  Test: tests/test_mocap.py::test_sequences.
 
-    A set of which nothing can be joined into a sequence comes back as its single clips, and says so.
+    A set of which nothing can be joined into a sequence comes back as its single clips, and says so; one clip alone,
+    a user's recording, is not looped.
     """
-    return _sequences(load(motion, rate, clips, split), f"{motion} [{split}]", seed, limit, verbose)
+    single = load(motion, rate, clips, split, reading)
+    if len(single) == 1:
+        if verbose:
+            print(f"{motion} [{split}] one clip, {single[0].seconds:.1f} s, as it is")
+        return single
+    return _sequences(single, f"{motion} [{split}]", seed, limit, verbose)
 
 
 def _sequences(single, title, seed=0, limit=0.15, verbose=True):
@@ -904,41 +444,51 @@ def describe(clip: Clip) -> str:
     )
 
 
-def inspect(path) -> None:
+def inspect(path, reading=AS_IT_IS) -> None:
     """Print what a file or a folder holds.  Test: tests/test_mocap.py::test_inspect."""
     path = Path(path)
     if path.is_dir():
-        clips = load(path)
+        clips = load(path, reading=reading)
         for clip in clips:
             print(describe(clip))
         _sequences(clips, f"{path} [all]")
         return
-    if _is_amc(path):
-        clip, b, rig, joints = from_amc(path), _read_amc(path)[0], "cmu", CMU_BONES
+    if is_amc(path):
+        clip, b, name, joints = from_amc(path), rigs.read_amc(path)[0], "cmu", rigs.CMU_BONES
     else:
-        b = _read(path)
-        clip, rig = _canonical(b), rig_of(b)
-        joints = RIGS[rig].joints
+        b = rigs.read(path)
+        rig, name = rigs.rig_for(b, reading)
+        clip, joints = rigs.canonical(b, rig, name), rig.joints
     segment = {joint: s for s, joint in joints.items()}
-    print(f"{path}: rig {rig}, {len(b.names)} joints")
+    print(f"{path}: rig {name}, {len(b.names)} joints")
     depth = []
-    for name, parent in zip(b.names, b.parents):
+    for joint, parent in zip(b.names, b.parents):
         depth.append(depth[parent] + 1 if parent >= 0 else 0)
-        print(f"  {'  ' * depth[-1]}{name:18s} {segment.get(name, '')}".rstrip())
+        print(f"  {'  ' * depth[-1]}{joint:18s} {segment.get(joint, '')}".rstrip())
     print(describe(clip))
 
 
 def main(argv=None) -> None:
-    """python mocap.py inspect FILE|FOLDER."""
+    """python mocap.py inspect FILE|FOLDER, or fetch NAME.  Test: tests/test_cli.py::test_mocap_inspect"""
     parser = argparse.ArgumentParser(
         prog="mocap.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     sub = parser.add_subparsers(dest="command", required=True)
     p = sub.add_parser("inspect", help="print skeleton, rate, length, speed and contacts")
     p.add_argument("path", help="a .bvh or .amc file, or a folder of them")
-    for each in (parser, p):  # one line, as in runs.cli
+    for name, text in rigs.HELP.items():
+        p.add_argument("--" + name.replace("_", "-"), help=text)
+    f = sub.add_parser("fetch", help="download a data set, its licence and citation first")
+    f.add_argument("name", choices=tuple(fetch.DATASETS))
+    f.add_argument("--out", help="folder (default: data/NAME)")
+    f.add_argument("--url", metavar="BASE", help="another server with the same paths, such as http://127.0.0.1:8000")
+    for each in (parser, p, f):  # one line, as in runs.cli
         each.error = lambda message: parser.exit(2, f"mocap.py: error: {message} (see --help)\n")
-    inspect(parser.parse_args(argv).path)
+    args = parser.parse_args(argv)
+    if args.command == "fetch":
+        fetch.fetch(args.name, args.out, args.url)
+        return
+    inspect(args.path, Reading.of(args))
 
 
 if __name__ == "__main__":

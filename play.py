@@ -2,7 +2,10 @@ r"""Run a policy: measure it, look at it, record it  [Reda23 §4].
 
     python play.py --character jesse --motion FOLDER --measure [--json OUT]     the table of spec/metrics, four rows
     python play.py --character jesse --motion FOLDER --png OUT | --video OUT    headless pictures
+    python play.py --character jesse --motion FOLDER --bvh OUT                  what the character did, as BVH
     python play.py --character jesse --motion FOLDER --view | --view web        MuJoCo's viewer: window or browser
+    python play.py --character jesse --stream FILE.csv | --stream -             a headset's recording, or a live one
+    python play.py --character jesse --motion FOLDER --measure --push 400@2     the largest push survived
 
 Rows of the table: `policy` (its mean action), `kinematic` (the retargeted pose itself), `zero` (no torque) and `pd`
 (open-loop PD tracking of the reference).  Targets and labels are the human's for all rows.
@@ -10,20 +13,27 @@ Rows of the table: `policy` (its mean action), `kinematic` (the retargeted pose 
 
 from __future__ import annotations
 
+import contextlib
 import json
+import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 
 import mocap
 import retarget
+import stream
 from env import EPISODE_STEPS, Env
-from mocap import quat_angle, quat_conj, quat_mul, quat_rotate
+from mocap import heading, quat_angle, quat_conj, quat_mul, quat_rotate
 from ppo import check_fits, load_policy
 from retarget import Character, Reference, forward_kinematics, sole_motion
+from rigs import HELP, Reading
 from runs import NONNEGATIVE, POSITIVE, UserError, arg, atomic_write, cli, run_main
+from stream import AXES, SAMPLE_RATE
 
 
 @dataclass
@@ -33,6 +43,9 @@ class Options:
     character: str = arg("jesse", "name in characters/, or path of a .toml")
     motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names")
+    joint_map: str | None = arg(None, HELP["joint_map"])
+    unit: str | None = arg(None, HELP["unit"])
+    up: str | None = arg(None, HELP["up"])
     policy: str | None = arg(None, "run folder or policy .npz; characters/NAME.npz by default")
     measure: bool = arg(False, "print every metric for policy, kinematic, zero and pd")
     json: str | None = arg(None, "write the measured table here")
@@ -47,14 +60,30 @@ class Options:
         256, "characters started at random frames for the time to failure (0: leave it out)", check=NONNEGATIVE
     )
     sequence: int = arg(0, "which sequence to show", check=NONNEGATIVE)
-    seconds: float = arg(10.0, "how much of it to show", check=POSITIVE)
+    seconds: float | None = arg(None, "how much of it to show: 10 s by default, all of a stream", check=POSITIVE)
     every: float = arg(0.5, "seconds between the pictures of the contact sheet", check=POSITIVE)
     png: str | None = arg(None, "write a contact sheet")
     video: str | None = arg(None, "write a video (.mp4; needs the extra `view`)")
+    bvh: str | None = arg(None, "write what the character did, until it failed or the episode ended, as BVH")
     view: str | None = arg(
         None, "show it live: window (MuJoCo's viewer) or web (in a browser)", choices=("window", "web")
     )
     port: int = arg(0, "port of the browser viewer, 0 = the first free one from 8080", check=NONNEGATIVE)
+    stream: str | None = arg(None, "drive the character with a headset's .csv file, or - for standard input")
+    axes: str = arg("unity", "axes of the stream", choices=tuple(AXES))
+    grip: float | None = arg(
+        None, "how far the fingers point below the controllers' forward axis [degrees]: unity 15, else 90 by default"
+    )
+    sample_rate: float = arg(SAMPLE_RATE, "rows a second of a stream without times", check=POSITIVE)
+    user_height: float | None = arg(
+        None, "height of the standing user's headset [m]; from the stream's first second by default", check=POSITIVE
+    )
+    realtime: bool = arg(False, "play a stream at the wall clock's pace and report the deadlines missed")
+    push: str | None = arg(
+        None,
+        "N@T or N@T:DIRECTION: push the root with N newtons for 0.2 s at T s to its forward (default), left, back or "
+        "right; with --measure: the largest push survived at T s, up to N, to all four",
+    )
     seed: int = arg(0, "seed of stitching and random starts", check=NONNEGATIVE)
     threads: int = arg(0, "physics threads, 0 = all cores", check=NONNEGATIVE)
 
@@ -87,6 +116,99 @@ def pd_action(env: Env):
     return np.clip(PD_STIFFNESS * error + PD_DAMPING * rate, -1.0, 1.0)[:, h]
 
 
+# ------------------------------------------------------------------------------------ pushes
+
+PUSH_SECONDS = 0.2
+RECOVERY = 3.0  # s after the push that the character must live, to have survived it
+DIRECTIONS = {"forward": 0.0, "left": np.pi / 2, "back": np.pi, "right": -np.pi / 2}
+
+
+@dataclass(frozen=True)
+class Push:
+    """A constant horizontal force on the root's centre of mass for 0.2 s.
+
+    newtons, angle : numbers or (N,); angle to the character's heading at every moment, 0 forward, π/2 left
+    at             : seconds from the start
+    """
+
+    newtons: float | np.ndarray
+    at: float
+    angle: float | np.ndarray = 0.0
+
+    def force(self, t, yaw):
+        """World force on the root at time t, heading yaw (both (...)).  (..., 3) [N]
+
+        Test      tests/test_play.py::test_push"""
+        on = (t > self.at - 1e-9) & (t < self.at + PUSH_SECONDS - 1e-9)
+        size, angle = self.newtons * on, yaw + self.angle
+        return np.stack([size * np.cos(angle), size * np.sin(angle), 0.0 * size * angle], axis=-1)
+
+
+def parse_push(text: str | None) -> Push | None:
+    """N@T or N@T:DIRECTION.  UserError: anything else.  Test: tests/test_play.py::test_push"""
+    if text is None:
+        return None
+    number = r"(\d+(?:\.\d*)?|\.\d+)"
+    found = re.fullmatch(rf"{number}@{number}(?::(\w+))?", text.strip())
+    if not found or (found[3] or "forward") not in DIRECTIONS:
+        valid = ", ".join(DIRECTIONS)
+        raise UserError(f"--push {text}: valid: N@T or N@T:DIRECTION, as 200@2 or 200@2.5:left; directions: {valid}")
+    return Push(float(found[1]), float(found[2]), DIRECTIONS[found[3] or "forward"])
+
+
+def largest_push(char: Character, ref: Reference, act, at, most, sequences=8, rounds=6, threads=0) -> dict:
+    r"""The largest push survived, by bisection, on evenly chosen sequences and in four directions.
+
+    Survived  no failure of [Reda23 §3.6] within 3 s after the push began; a sequence that fails without a push before
+              then, or ends, is left out
+    Args      at : s from the sequence's start; most : largest push tried [N]
+    Returns   direction -> (k,) largest push survived [N], 0 if none, on the k sequences that live without one;
+              "tried" -> number of sequences; "resolution" [N]
+    Test      tests/test_play.py::test_largest_push
+    """
+    steps = round((at + RECOVERY) * ref.rate)
+    long = np.flatnonzero(ref.last - ref.first >= steps)
+    chosen = long[np.unique(np.linspace(0, len(long) - 1, min(sequences, len(long))).round().astype(int))]
+    if not len(chosen):
+        raise UserError(f"no sequence is {at + RECOVERY:.1f} s long; push earlier than {at} s")
+    angle = np.tile(list(DIRECTIONS.values()), len(chosen))
+    first = np.repeat(ref.first[chosen], len(DIRECTIONS))
+    env = Env(char, ref, len(first), threads=threads, horizon=len(ref), autoreset=False)
+    xfrc = env.batch.bind("xfrc_applied")
+
+    def survives(newtons):
+        env.reset(frames=first)
+        push, alive = Push(newtons, at, angle), np.ones(env.n, bool)
+        for _ in range(steps):
+            xfrc[:, char.root, :3] = push.force(env.steps * env.dt, heading(env.qpos[:, 3:7]))
+            alive &= ~env.step(act(env))[2]
+        return alive
+
+    low, high = np.zeros(env.n), np.full(env.n, float(most))
+    lives = survives(low)
+    low = np.where(survives(high), high, low)
+    for _ in range(rounds):
+        middle = (low + high) / 2
+        ok = survives(middle)
+        low, high = np.where(ok, middle, low), np.where(ok, high, middle)
+    rows = {name: low[k :: len(DIRECTIONS)][lives[k :: len(DIRECTIONS)]] for k, name in enumerate(DIRECTIONS)}
+    return rows | {"tried": len(chosen), "resolution": most / 2**rounds}
+
+
+def push_report(found: dict, push: Push) -> str:
+    """The largest pushes as text.  Test: tests/test_play.py::test_largest_push"""
+    n = len(found["forward"])
+    lines = [
+        f"largest push survived: {PUSH_SECONDS} s at {push.at} s, then {RECOVERY:.0f} s; up to {push.newtons:.0f} N, "
+        f"by {found['resolution']:.1f} N; {n} of {found['tried']} sequences live without one"
+    ]
+    for name in DIRECTIONS if n else ():
+        k = found[name]
+        lines.append(f"{name:8s} median {np.median(k):.0f} N ({PUSH_SECONDS * np.median(k):.0f} N s), "
+                     f"least {k.min():.0f} N, most {k.max():.0f} N")  # fmt: skip
+    return "\n".join(lines)
+
+
 # ------------------------------------------------------------------------------------ running
 
 
@@ -107,10 +229,13 @@ class Recording:
     available: int
 
 
-def simulate(char: Character, ref: Reference, act, horizon=EPISODE_STEPS, threads=0, only=None) -> list[Recording]:
+def simulate(
+    char: Character, ref: Reference, act, horizon=EPISODE_STEPS, threads=0, only=None, push: Push | None = None
+) -> list[Recording]:
     """Run every sequence from its first frame, to its end, to `horizon` control steps, or to failure.
 
     Args      act : function of the Env -> actions (N, u); only : indices of sequences, or None for all
+              push : what shoves every character, or None
     Returns   one Recording a sequence; the state that failed is not part of it
     Test      tests/test_play.py::test_simulate
     """
@@ -121,7 +246,10 @@ def simulate(char: Character, ref: Reference, act, horizon=EPISODE_STEPS, thread
     alive = np.ones(env.n, bool)
     qpos, contact, action = [env.qpos.copy()], [env.ref.contact[env.frame]], [np.zeros((env.n, env.action_size))]
     lived, failed = np.zeros(env.n, int), np.zeros(env.n, bool)
+    xfrc = env.batch.bind("xfrc_applied")
     while alive.any():
+        if push:
+            xfrc[:, char.root, :3] = push.force(env.steps * env.dt, heading(env.qpos[:, 3:7]))
         _, _, terminated, truncated, _ = env.step(act(env))
         qpos.append(env.qpos.copy()), contact.append(env.contact.copy()), action.append(env.action.copy())
         failed |= alive & terminated
@@ -329,6 +457,7 @@ def measure_all(char, ref, policy, opt: Options) -> dict:
     actions |= {"kinematic": None, "zero": zero_action, "pd": pd_action}
     out = {}
     for name, act in actions.items():
+        print(f"measuring {name}: {len(ref.names)} sequences", file=sys.stderr, flush=True)
         recordings = simulate(char, ref, act, threads=opt.threads) if act else kinematic(char, ref)
         out[name] = measure(char, ref, recordings)
         if act and opt.random_starts:
@@ -361,13 +490,13 @@ def pictures(char: Character, ref: Reference, recording: Recording, frames, size
     return images
 
 
-def show(char: Character, ref: Reference, policy, sequence: int, how: str, port: int) -> None:
+def show(char: Character, ref: Reference, policy, sequence: int, how: str, port: int, push: Push | None = None) -> None:
     """Run the policy in real time in MuJoCo's viewer until it is closed; over again at the sequence's end or a failure.
 
     The environment steps the physics; the viewer only draws the states it is sent, the three sensor poses as boxes.
 
     Args      how : "window" (needs a display) or "web" (serves a page; needs none)
-              port : of the page, 0 = the first free one from 8080
+              port : of the page, 0 = the first free one from 8080; push : as in `simulate`
     Raises    UserError: no display, or the port is taken
     Test      tests/test_play_view.py::test_web_view
     """
@@ -379,6 +508,7 @@ def show(char: Character, ref: Reference, policy, sequence: int, how: str, port:
     act = policy_action(policy)
     start = ref.first[[sequence]]
     env.reset(frames=start)
+    xfrc = env.batch.bind("xfrc_applied")
 
     def pose():
         data.qpos[:], data.mocap_pos[:] = env.qpos[0], ref.sensor_pos[env.frame[0]]
@@ -390,6 +520,8 @@ def show(char: Character, ref: Reference, policy, sequence: int, how: str, port:
         clock = time.perf_counter()
         while handle.is_running():
             handle.sync()
+            if push:
+                xfrc[:, char.root, :3] = push.force(env.steps * env.dt, heading(env.qpos[:, 3:7]))
             _, _, terminated, truncated, _ = env.step(act(env))
             if terminated[0] or truncated[0]:
                 why = "fell or lost the user" if terminated[0] else "reached the end"
@@ -467,6 +599,79 @@ def _open_viewer(model, data, root, how, port):
     return handle
 
 
+# ------------------------------------------------------------------------------------ a headset's stream
+
+PICTURED = 600.0  # s of a stream that pictures are kept of, at most
+
+
+def play_stream(char: Character, policy, path, opt: Options) -> None:
+    """Drive the character with a recorded or live headset; print what happened.
+
+    Raises    UserError: the stream cannot be read, or shows no headset for a second
+    Test      tests/test_stream.py::test_command_line, test_stdin, test_web_view
+    """
+    live = opt.stream == "-"
+    push = parse_push(opt.push)
+    player = stream.Player(char, policy.mean_action, force=push.force if push else None)
+    check_fits(policy, player, path)
+    source = stream.Stream(
+        char, opt.axes, sample_rate=opt.sample_rate, grip=opt.grip, user_height=opt.user_height
+    )  # fmt: skip
+    reader = stream.Reader("standard input" if live else opt.stream, strict=not live)
+    samples = reader.read(stream.lines_of(opt.stream))
+    pace = stream.Pace(player.dt) if opt.realtime or opt.view else None
+    if live and pace:
+        samples = stream.arriving(samples, stream.GAP, player.dt)
+    seen = []
+    keep = PICTURED / player.dt if opt.png or opt.video else 0
+    with contextlib.ExitStack() as stack:
+        handle = None
+        if opt.view:
+            rest = SimpleNamespace(sensor_pos=np.zeros((1, 3, 3)), sensor_quat=np.tile(np.eye(1, 4), (1, 3, 1)))
+            shown = _shown_model(char, rest)
+            data = mujoco.MjData(shown)
+            handle = stack.enter_context(_open_viewer(shown, data, char.root, opt.view, opt.port))
+
+        def see(player, tick):
+            if len(seen) < keep:
+                seen.append((player.qpos[0].copy(), tick.pos, tick.quat))
+            if handle:
+                data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = player.qpos[0], tick.pos, tick.quat
+                data.time += player.dt
+                mujoco.mj_forward(shown, data)
+                handle.sync()
+                return handle.is_running()
+
+        with contextlib.suppress(KeyboardInterrupt):  # the end of a live stream; what happened is still told
+            stream.drive(source, samples, player, opt.seconds, pace, see)
+    if source.calibration is None:
+        raise UserError(
+            f"{reader.name}: {source.rows} rows show the headset for {source.tracked():.2f} s; "
+            f"calibration needs {stream.CALIBRATION} s"
+        )
+    unreadable = [f"{reader.unreadable} lines could not be read"] if reader.unreadable else []
+    print(*source.report(), *unreadable, *player.report(), *(pace.report() if pace else []), sep="\n")
+    if seen:
+        qpos, pos, quat = map(np.array, zip(*seen, strict=True))
+        recording = SimpleNamespace(qpos=qpos, frames=np.arange(len(qpos)))
+        _write_pictures(char, SimpleNamespace(sensor_pos=pos, sensor_quat=quat), recording, len(qpos) - 1, opt)
+
+
+def _write_pictures(char, ref, recording, last, opt):
+    """The contact sheet and the video that the options ask for.  Test: tests/test_cli.py::test_play_png"""
+    import render
+
+    if opt.png:
+        frames = np.arange(0, last + 1, max(1, round(opt.every * mocap.CONTROL_RATE)))
+        labels = [f"{t / mocap.CONTROL_RATE:.1f} s" for t in frames]
+        render.write_png(opt.png, render.contact_sheet(pictures(char, ref, recording, frames), labels, 5))
+        print(opt.png)
+    if opt.video:
+        images = pictures(char, ref, recording, range(last + 1), (640, 480), fast=True)
+        render.write_video(opt.video, images, mocap.CONTROL_RATE)
+        print(opt.video)
+
+
 # ------------------------------------------------------------------------------------ command line
 
 
@@ -488,48 +693,56 @@ def main(argv=None):
         if a == "--view" and (i + 1 == len(argv) or argv[i + 1].startswith("--")):
             argv[i] = "--view=window"
     opt = cli(Options, argv, "play.py", __doc__)
-    if not (opt.measure or opt.png or opt.video or opt.view):
-        raise UserError("nothing to do: give --measure, --png OUT, --video OUT or --view")
-    for out in filter(None, (opt.json, opt.png, opt.video)):
+    if not (opt.measure or opt.png or opt.video or opt.bvh or opt.view or opt.stream):
+        raise UserError("nothing to do: give --measure, --png OUT, --video OUT, --bvh OUT, --view or --stream FILE")
+    if opt.stream and opt.bvh:
+        raise UserError("--bvh records a motion, not a stream; give one of the two")
+    if opt.stream and opt.measure:
+        raise UserError("--measure compares with a human's motion, which a stream has not; give one of the two")
+    push = parse_push(opt.push)
+    for out in filter(None, (opt.json, opt.png, opt.video, opt.bvh)):
         if not Path(out).resolve().parent.is_dir():
             raise UserError(f"cannot write {out}: there is no folder {Path(out).parent}")
     if opt.json and not opt.measure:
         raise UserError("--json writes the table of --measure: give both")
     char = retarget.character(opt.character)
     policy, path = find_policy(opt)
-    clips = mocap.sequences(opt.motion, "all" if opt.all else opt.split, opt.clips, seed=opt.seed)
+    if opt.stream:
+        play_stream(char, policy, path, opt)
+        return
+    clips = mocap.sequences(
+        opt.motion, "all" if opt.all else opt.split, opt.clips, seed=opt.seed, reading=Reading.of(opt)
+    )
     if opt.user_scale != 1.0:
         clips = [mocap.resize(c, opt.user_scale) for c in clips]
     if opt.sequence >= len(clips):
         raise UserError(f"--sequence {opt.sequence}: there are {len(clips)}, from 0")
     ref = retarget.reference(char, clips)
     check_fits(policy, Env(char, ref, 1), path)
-    if opt.measure:
+    if opt.measure and push:
+        found = largest_push(char, ref, policy_action(policy), push.at, push.newtons, threads=opt.threads)
+        print(push_report(found, push))
+        if opt.json:
+            as_lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in found.items()}
+            atomic_write(opt.json, json.dumps(as_lists, indent=2) + "\n")
+    elif opt.measure:
         results = measure_all(char, ref, policy, opt)
         print(table(results))
         if opt.json:
             atomic_write(opt.json, as_json(results))
-    if opt.png or opt.video:
-        import render
-
-        recording = simulate(char, ref, policy_action(policy), threads=opt.threads, only=[opt.sequence])[0]
-        last = min(len(recording.frames) - 1, int(opt.seconds * mocap.CONTROL_RATE))
+    if opt.png or opt.video or opt.bvh:
+        recording = simulate(char, ref, policy_action(policy), threads=opt.threads, only=[opt.sequence], push=push)[0]
+        last = min(len(recording.frames) - 1, int((opt.seconds or 10.0) * mocap.CONTROL_RATE))
         print(
             f"{ref.names[opt.sequence]}: lived {(len(recording.frames) - 1) / mocap.CONTROL_RATE:.1f} s "
             f"of {recording.available / mocap.CONTROL_RATE:.1f}"
         )
-        if opt.png:
-            frames = np.arange(0, last + 1, max(1, round(opt.every * mocap.CONTROL_RATE)))
-            labels = [f"{t / mocap.CONTROL_RATE:.1f} s" for t in frames]
-            render.write_png(opt.png, render.contact_sheet(pictures(char, ref, recording, frames), labels, 5))
-            print(opt.png)
-        if opt.video:
-            render.write_video(
-                opt.video, pictures(char, ref, recording, range(last + 1), (640, 480), fast=True), mocap.CONTROL_RATE
-            )
-            print(opt.video)
+        if opt.bvh:
+            retarget.write_bvh(opt.bvh, char, recording.qpos, mocap.CONTROL_RATE)
+            print(opt.bvh)
+        _write_pictures(char, ref, recording, last, opt)
     if opt.view:
-        show(char, ref, policy, opt.sequence, opt.view, opt.port)
+        show(char, ref, policy, opt.sequence, opt.view, opt.port, push)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import time
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
-# OpenBLAS's idle threads spin for 25 ms before they sleep and take the cores from the physics (design.md, mistake 14).
+# OpenBLAS's idle threads spin for 25 ms before they sleep and take the cores from the physics.
 # 2^10 cycles is enough; it must be said before NumPy is loaded.
 os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "10")
 
@@ -39,9 +39,11 @@ from nn import (
     value_loss,
 )
 from retarget import TERMS
+from rigs import HELP, Reading
 from runs import (
     ALL_POSITIVE,
     CHECKPOINT,
+    CONFIG,
     METRICS,
     NONNEGATIVE,
     POSITIVE,
@@ -71,11 +73,15 @@ BELOW_ONE = (lambda v: 0 < v < 1, "between 0 and 1")
 class Options:
     """Everything a run is made of.
 
-    Table 3 of the paper (its hyper-parameters) is lost: these are ASSUMED, from measured runs."""
+    Table 3 of the paper (its hyper-parameters) is not in the text we work from: these are ASSUMED, from measured runs.
+    """
 
     character: str = arg("jesse", "name in characters/, or path of a .toml")
     motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names, such as '*walk*'")
+    joint_map: str | None = arg(None, HELP["joint_map"])
+    unit: str | None = arg(None, HELP["unit"])
+    up: str | None = arg(None, HELP["up"])
     steps: int = arg(20_000_000, "control steps to train", check=POSITIVE)
     envs: int = arg(512, "characters simulated side by side", check=POSITIVE)
     horizon: int = arg(16, "control steps of each character per update", check=POSITIVE)
@@ -409,7 +415,7 @@ class Trainer:
         self.old_value = policy.value(self.x.reshape(t * n, -1)).reshape(t, n)
         self.next_value[:-1] = self.old_value[1:]
         self.next_value[-1] = policy.value(policy.norm.normalise(env.full))  # App. B: bootstrap at the trajectory's end
-        for step, ids, rows in finals:  # truncation is not failure (design.md, mistake 1)
+        for step, ids, rows in finals:  # truncation is not failure
             self.next_value[step, ids] = policy.value(rows)
         self.next_value[self.terminated] = 0.0
 
@@ -514,7 +520,7 @@ def make_env(opt: Options) -> Env:
     Test      tests/test_ppo.py::test_make_env_augments
     """
     char = retarget.character(opt.character)
-    clips = mocap.sequences(opt.motion, "train", opt.clips, seed=opt.seed)
+    clips = mocap.sequences(opt.motion, "train", opt.clips, seed=opt.seed, reading=Reading.of(opt))
     if opt.augment:
         clips = mocap.augment(clips, np.random.default_rng([opt.seed, 3]))
     disturbance = Disturbance(opt.sensor_offset, opt.sensor_noise, opt.push)
@@ -531,6 +537,8 @@ def resumed_options(opt: Options, argv) -> Options:
     Raises    UserError: a given option differs from the stored one
     Test      tests/test_ppo.py::test_resume_refuses_other_options
     """
+    if not (Path(opt.out) / CONFIG).exists():
+        raise UserError(f"{opt.out} holds no run to resume: leave out --resume to start one")
     stored = read_config(opt.out)["config"]
     given = {a.split("=")[0].lstrip("-").replace("-", "_") for a in argv if a.startswith("--")}
     values = {}
@@ -574,6 +582,8 @@ def train(opt: Options) -> Trainer:
     out = Path(opt.out)
     loaded = latest_checkpoint(out, ("policy.*",)) if opt.resume else None
     began = time.perf_counter()
+    if not opt.resume and (out / CONFIG).exists():
+        raise UserError(f"{out} already holds a run: add --resume to continue it, or choose another folder")
     # The configuration is checked and the motions are read before the folder is made: a typo leaves nothing behind.
     env = make_env(opt)
     trainer = Trainer(opt, env)

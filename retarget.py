@@ -113,7 +113,20 @@ def character(name: str | Path, visual=False) -> Character:
 class _Loader:
     """Resolves the TOML's names in the model; every complaint names the file, the table and what would be valid."""
 
-    TABLES = ("root", "map", "torque", "passive", "observation", "reward", "feet", "sensors", "fall")
+    KEYS = dict(  # what each table may hold; None: names that are checked where they are used
+        root=("body", "scale_xy", "scale_z"),
+        map=None,
+        torque=("base", "scale"),
+        passive=("stiffness", "damping", "armature"),
+        observation=("links",),
+        reward=(*TERMS, "fail", "joints", "links"),
+        feet=("bodies", "contact_sensors"),
+        sensors=("sites",),
+        fall=("bodies",),
+        pose=None,
+        metrics=("sip",),
+    )
+    TABLES = tuple(t for t in KEYS if t not in ("pose", "metrics"))  # those that must be there
     SHAPES = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
 
     def __init__(self, path, spec, visual):
@@ -121,6 +134,12 @@ class _Loader:
         for table in self.TABLES:
             if not isinstance(spec.get(table), dict):
                 self.fail(f"has no table [{table}]; needed: {', '.join(self.TABLES)}")
+        for name, value in spec.items():
+            if name not in (*self.KEYS, "name", "model"):
+                self.fail(f"has {name!r}, which means nothing; valid: name, model, {', '.join(self.KEYS)}")
+            for key in value if self.KEYS.get(name) else ():
+                if key not in self.KEYS[name]:
+                    self.fail(f"[{name}] has {key!r}, which means nothing; valid: {', '.join(self.KEYS[name])}")
         self.xml = path.parent / str(spec.get("model", path.stem + ".xml"))
         if not self.xml.is_file():
             found = ", ".join(sorted(p.name for p in path.parent.glob("*.xml"))) or "none"
@@ -716,8 +735,8 @@ def artefacts(char: Character, clip: Clip, pose: Pose) -> dict:
 def write_bvh(path, char: Character, qpos, rate) -> None:
     r"""A character's motion as BVH: a joint for each of its bodies.
 
-    Method    rotation of a body in its parent, all its hinges in one; the root also moves.  OFFSETs are the distances
-              of the bodies' origins, End Sites lie as far beyond their last body's centre of mass as that from its origin
+    Method    rotation of a body in its parent, all its hinges in one; the root also moves.  OFFSETs are those of the
+              bodies' origins; an End Site lies as far beyond its body's centre of mass as that from the origin
     Frame     y up, z forward, x left, centimetres, as animation tools expect: (x, y, z) of ours is (z, x, y)
     Args      qpos (T, nq); rate [Hz]
     Raises    UserError: the file cannot be written, or a body's origin moves in its parent (a hinge beside it)
@@ -741,17 +760,9 @@ def write_bvh(path, char: Character, qpos, rate) -> None:
     local = np.concatenate([local[..., :1], to_file(local[..., 1:])], axis=-1)
     names = [m.body(b).name or f"body{b}" for b in bodies]
     leaves = {n: 200.0 * to_file(m.body_ipos[b]) for n, b in zip(names, bodies) if b not in m.body_parentid[bodies]}
+    root, offsets = 100.0 * to_file(fk.xpos[:, char.root]), 100.0 * to_file(offsets)
     try:
-        bvh.write(
-            path,
-            names,
-            parents,
-            100.0 * to_file(offsets),
-            1.0 / rate,
-            100.0 * to_file(fk.xpos[:, char.root]),
-            local,
-            leaves,
-        )
+        bvh.write(path, names, parents, offsets, 1.0 / rate, root, local, leaves)
     except OSError as e:
         raise UserError(f"cannot write {path}: {e.strerror or e}; give a folder that exists and is writable") from None
     except bvh.BvhError as e:

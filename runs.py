@@ -493,7 +493,8 @@ class Progress:
         """The text for `done` work and `values`, an ordered dict of name -> formatted text."""
         spent, fresh = time.perf_counter() - self.began, done - self.start
         left = fmt_time(spent * (self.total - done) / fresh) if fresh > 0 else "?"
-        head = f"{100 * done / max(self.total, 1):5.1f}% {fmt_count(done)}/{fmt_count(self.total)} {self.unit}"
+        share = min(100 * done / max(self.total, 1), 100)
+        head = f"{share:5.1f}% {fmt_count(done)}/{fmt_count(self.total)} {self.unit}"
         return "  ".join([head, *(f"{k} {v}" for k, v in values.items()), f"{fmt_time(spent)} spent, {left} left"])
 
     def update(self, done, values):

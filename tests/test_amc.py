@@ -15,6 +15,7 @@ from test_mocap import rot, walk, write_as
 
 import amc
 import mocap
+import rigs
 from mocap import FEET, SEG, SEGMENTS
 from runs import UserError
 
@@ -553,7 +554,7 @@ def cmu_file(folder, poses, name="16", heights=0.95):
 
 def standing():
     """Turns that bring the zero pose upright: legs closed, arms down with palms inward, head and soles level."""
-    a, pitch = np.radians(20), {k: np.radians(v) for k, v in mocap.CMU_PITCH.items()}
+    a, pitch = np.radians(20), {k: np.radians(v) for k, v in rigs.CMU_PITCH.items()}
     pose = {"head": turn("x", pitch["head"])}
     for side, k in (("l", 1), ("r", -1)):
         pose[f"{side}femur"] = turn("z", -k * a)
@@ -622,7 +623,7 @@ def slow_human(s, row):
     metres = {n: ours @ p * 0.0254 / 0.45 for n, p in starts.items()}
     frames = {}
     for segment in SEGMENTS:
-        bone = mocap.CMU_BONES[segment]
+        bone = rigs.CMU_BONES[segment]
         side = segment[-2:]
         hinge = {"thigh": "tibia", "shin": "tibia", "foot": "tibia", "upper_arm": "radius", "forearm": "radius"}
         part = segment.removesuffix(side) if side in ("_l", "_r") else segment
@@ -635,7 +636,7 @@ def slow_human(s, row):
         forward = np.cross(left, up)
         forward /= np.linalg.norm(forward)
         m = ours @ turns[bone] @ np.stack([forward, np.cross(up, forward), up], axis=1)
-        frames[segment] = m @ turn("y", np.radians(-mocap.CMU_PITCH.get(segment, 0.0)))
+        frames[segment] = m @ turn("y", np.radians(-rigs.CMU_PITCH.get(segment, 0.0)))
     return metres, frames
 
 
@@ -646,7 +647,7 @@ def check_clip(path, s, motion, frames):
     for t in frames:
         metres, turns = slow_human(s, motion[t])
         for i, segment in enumerate(SEGMENTS):
-            want = metres[mocap.CMU_BONES[segment]]
+            want = metres[rigs.CMU_BONES[segment]]
             if segment == "pelvis":
                 want = (metres["lfemur"] + metres["rfemur"]) / 2
             np.testing.assert_allclose(clip.pos[t, i], want, atol=1e-9)
@@ -655,7 +656,7 @@ def check_clip(path, s, motion, frames):
 
 
 def test_from_amc_against_matrices(tmp_path, monkeypatch):
-    monkeypatch.setattr(mocap, "level", lambda clip: clip)
+    monkeypatch.setattr(rigs, "level", lambda clip: clip)
     _, s, motion = cmu_file(tmp_path, [{}] * 4)
     motion = np.cumsum(np.random.default_rng(0).normal(0, 0.4, motion.shape), axis=0)
     path = tmp_path / "16_02.amc"
@@ -664,7 +665,7 @@ def test_from_amc_against_matrices(tmp_path, monkeypatch):
 
 
 def test_recorded_against_matrices(mocap_dir, monkeypatch):
-    monkeypatch.setattr(mocap, "level", lambda clip: clip)
+    monkeypatch.setattr(rigs, "level", lambda clip: clip)
     for name in ("07/07_03", "35/35_28"):
         path = mocap_dir / "cmu" / f"{name}.amc"
         s = amc.read_asf(path.with_name(f"{name[:2]}.asf"))
@@ -729,7 +730,7 @@ def test_level(azimuth):
     flat = mocap.place(walk(8.0, 60.0, variation=0.0), azimuth, np.zeros(2), np.array([0.3, -0.2]))
     up = tilted(flat, 1.2, azimuth)
     assert up.ball[-1, 0, 2] - flat.ball[-1, 0, 2] > 0.1  # 10 m further on
-    got = mocap.level(up)
+    got = rigs.level(up)
     assert np.abs(got.pos - flat.pos).max() < 0.02 and np.abs(got.ball[..., 2] - flat.ball[..., 2]).max() < 0.01
     assert np.degrees(mocap.quat_angle(got.quat, flat.quat)).max() < 0.05
     np.testing.assert_allclose(np.linalg.norm(got.pos, axis=-1), np.linalg.norm(up.pos, axis=-1), atol=1e-9)
@@ -747,11 +748,11 @@ def test_level(azimuth):
     steep = np.hypot(*g)
     turned = Rotation.from_rotvec(np.array([-g[1], g[0], 0]) / steep * np.arctan(steep))
     np.testing.assert_allclose(got.pos[-1], turned.apply(up.pos[-1]), atol=1e-9)
-    assert mocap.level(steeper := tilted(flat, 4.0, azimuth)) is steeper
-    assert mocap.level(high := replace(flat, ball=flat.ball + [0, 0, 1.0])) is high
+    assert rigs.level(steeper := tilted(flat, 4.0, azimuth)) is steeper
+    assert rigs.level(high := replace(flat, ball=flat.ball + [0, 0, 1.0])) is high
     # a tilt across the way is not seen: the feet spread too little
     across = tilted(flat, 1.0, azimuth + np.pi / 2)
-    assert np.degrees(mocap.quat_angle(mocap.level(across).quat, across.quat)).max() < 0.35
+    assert np.degrees(mocap.quat_angle(rigs.level(across).quat, across.quat)).max() < 0.35
 
 
 def test_level_on_the_spot(tmp_path):

@@ -16,7 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_mocap import walk, write_as
+from test_rigs import write_rig
 
+import bvh
 import mocap
 import play
 import ppo
@@ -94,6 +96,7 @@ def test_help(script, capsys):
 def test_help_as_scripts():
     """From the shell, all at once; --help needs no OpenGL, no motion and no policy."""
     commands = [[f"{s}.py", "--help"] for s in SCRIPTS] + [["mocap.py", "inspect", "--help"]]
+    commands.append(["mocap.py", "fetch", "--help"])
     started = [subprocess.Popen([sys.executable, *c], cwd=ROOT, stdout=-1, stderr=-1, text=True) for c in commands]
     for process, command in zip(started, commands):
         out, err = process.communicate(timeout=60)
@@ -235,8 +238,44 @@ def test_mocap_inspect(tmp_path):
     )
 
 
+def test_any_bvh(here, capsys):
+    """A rig of other names, through every script that reads motion; what was guessed goes to stderr, once."""
+    write_rig(here / "walk.bvh", walk(2.0), "mixamo", unit=1.0, up="z")
+    assert run("mocap", "inspect", "walk.bvh") == 0
+    out, err = capsys.readouterr()
+    assert "rig guessed, " in out and re.search(r"mixamorig:LeftLeg +shin_l\n", out)
+    assert "thigh_r <- mixamorig:RightUpLeg" in err and "z is up" in err and "unit m:" in err and err.count("\n") == 3
+    assert run("retarget", "--motion", "walk.bvh", "--bvh", "jesse.bvh") == 0
+    assert "jesse.bvh" in capsys.readouterr().out and len(bvh.read("jesse.bvh").values) == 60
+    (here / "map.toml").write_text('unit = "m"\n[joints]\nhead = "mixamorig:Skull"\n')
+    for script in ("mocap", "retarget"):
+        args = ["inspect", "walk.bvh"] if script == "mocap" else ["--motion", "walk.bvh"]
+        err = refuse(capsys, here, script, *args, "--joint-map", "map.toml")
+        assert "map.toml: head = 'mixamorig:Skull'" in err and "mixamorig:Head" in err
+        assert "--unit 'ell'" in refuse(capsys, here, script, *args, "--unit", "ell")
+        assert "--up 'w'" in refuse(capsys, here, script, *args, "--up", "w")
+        assert "nowhere.toml" in refuse(capsys, here, script, *args, "--joint-map", "nowhere.toml")
+
+
+def test_play_bvh(here, capsys, monkeypatch):
+    """What the character did, frame for frame."""
+    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: [mocap.load("builtin", clips="stand_007")[0][:20]])
+    policy = small_policy(here / "p.npz")
+    assert run("play", "--policy", policy, "--bvh", "did.bvh", "--threads", 1) == 0
+    lived = re.search(r"lived (\d\.\d) s", capsys.readouterr().out)
+    b = bvh.read("did.bvh")
+    assert len(b.values) - 1 == pytest.approx(30 * float(lived[1]), abs=1.6) and b.names[0] == "pelvis"
+    assert "no folder" in refuse(capsys, here, "play", "--policy", policy, "--bvh", "no/did.bvh")
+
+
+def test_fetch_refuses(here, capsys):
+    assert "bandai" in refuse(capsys, here, "mocap", "fetch", "mixamo")
+    assert "http://" in refuse(capsys, here, "mocap", "fetch", "bandai", "--url", "somewhere")
+    assert "127.0.0.1:9" in refuse(capsys, here, "mocap", "fetch", "bandai", "--url", "http://127.0.0.1:9")
+
+
 def test_retarget(here, capsys):
-    assert run("retarget", "--clips", "0[02]_*") == 0
+    assert run("retarget", "--clips", "*_00[57]") == 0
     out = capsys.readouterr().out
     assert re.search(r"jesse: hips 0\.\d+ m, \d+ hinges, \d+ driven, [\d.]+ kg", out)
     assert "walk_005" in out and "stand_007" in out and "mean of 2: slide" in out

@@ -1,7 +1,7 @@
 """REPRODUCE.md against the code and the tests: every name it gives exists, and nothing it owes is missing.
 
 Part 1's table is `id | what | code | test`.  `code` holds `module.name` or `file.toml [table] key`, `test` holds
-`tests/test_x.py::test_a`; a row without a test says `not yet`, `not run yet` or `lost`.  Part 2's tables are
+`tests/test_x.py::test_a`; a row without a test says `not yet`, `not run yet` or `missing`.  Part 2's tables are
 `id | not said | choice | where | why`.
 """
 
@@ -16,7 +16,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = sorted(p.stem for p in ROOT.glob("*.py"))
-OPEN = ("not yet", "not run yet", "lost")
+OPEN = ("not yet", "not run yet", "missing")
 
 REQUIRED = (
     *(f"Eq. {k}" for k in range(1, 12)),
@@ -35,7 +35,7 @@ REQUIRED = (
         "head_wobble_deg_s", "torque_rms", "saturation",
     )),
 )  # fmt: skip
-MAY_BE_OPEN = ("Table 1", "Table 3", "§4, §5")  # lost, or experiments: these need no code and no test
+MAY_BE_OPEN = ("Table 1", "Table 3", "§4, §5")  # missing, or experiments: these need no code and no test
 
 GAPS = (  # every GAP and ASSUMED of the specification, in its order
     "advantage", "lambda", "Table 3", "Table 1", "previous user frame", "root scale axes", "link weights",
@@ -144,7 +144,7 @@ def test_every_row_is_complete():
 
 @pytest.mark.parametrize("wanted", REQUIRED)
 def test_nothing_of_the_specification_is_missing(wanted):
-    """A row for every equation, table, threshold and metric; with code and test unless it is lost or not run."""
+    """A row for every equation, table, threshold and metric; with code and test unless it is missing or not run."""
     found = [r for r in rows(1) if r[0] == wanted]
     assert found, f"REPRODUCE.md, part 1 has no row {wanted!r}"
     if not wanted.startswith(MAY_BE_OPEN):

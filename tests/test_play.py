@@ -67,6 +67,54 @@ def still(char, ref, t=31, yaw=0.0):
     return replace(ref, **changes), Recording(f, qpos.copy(), np.zeros((t, 2), bool), action, False, t - 1)
 
 
+# ------------------------------------------------------------------------------------ pushes
+
+
+def test_push(char, ref):
+    """What the flag says, when the force acts, and the momentum it gives: N × 0.2 s along the heading."""
+    assert play.parse_push(None) is None and play.parse_push("200@2") == play.Push(200.0, 2.0, 0.0)
+    assert play.parse_push("50.5@.5:left") == play.Push(50.5, 0.5, np.pi / 2)
+    for text in ("200", "200@", "-3@2", "200@2:up", "nan@2", "200@2:leftx"):
+        with pytest.raises(UserError, match="valid: N@T or N@T:DIRECTION.*forward, left, back, right"):
+            play.parse_push(text)
+    push = play.parse_push("300@0.1:right")
+    times = np.array([0.0, 0.09, 0.1, 0.29, 0.3, 1.0])
+    assert np.flatnonzero(np.linalg.norm(push.force(times, np.zeros(6)), axis=1)).tolist() == [2, 3]
+    assert np.allclose(push.force(0.1, np.pi / 2), [300, 0, 0])  # its right, when it looks along y
+    env = Env(char, ref, 1, threads=1, autoreset=False, horizon=1000)
+    env.reset(frames=[1])
+    env.qpos[:, 2] += 5.0  # in the air nothing else pushes
+    env.qvel[:] = 0.0
+    yaw, xfrc, com = mocap.heading(env.qpos[0, 3:7]), env.batch.bind("xfrc_applied"), []
+    env.batch.forward(np.arange(1), retarget.STAGE_VEL)
+    for _ in range(15):
+        xfrc[:, char.root, :3] = push.force(env.steps * env.dt, yaw)
+        com.append(env.com[0, char.root].copy())
+        env.step(play.zero_action(env))
+    velocity = (com[14] - com[12]) / (2 * env.dt)
+    gain = 300 * play.PUSH_SECONDS / char.model.body_subtreemass[0]
+    np.testing.assert_allclose(velocity[:2], gain * np.array([np.sin(yaw), -np.cos(yaw)]), rtol=0.02, atol=0.01)
+
+
+def test_largest_push(char, ref, monkeypatch):
+    """What it reports is survived, and a little more is not; without a survivor it says so."""
+    monkeypatch.setattr(play, "RECOVERY", 1.0)
+    found = play.largest_push(char, ref, cheat, 0.5, 60_000.0, rounds=5, threads=1)
+    assert found["tried"] == 1 and found["resolution"] == 60_000 / 32
+    for name, angle in play.DIRECTIONS.items():
+        (most,) = found[name]
+        assert 0 < most < 60_000
+        for newtons, fails in ((most, False), (most + found["resolution"], True)):
+            rec = play.simulate(char, ref, cheat, only=[1], threads=1, push=play.Push(newtons, 0.5, angle))[0]
+            assert rec.failed is fails
+    text = play.push_report(found, play.Push(60_000.0, 0.5))
+    assert "1 of 1 sequences" in text and text.count("median") == 4
+    limp = play.largest_push(char, ref, lambda env: np.ones((env.n, env.action_size)), 0.5, 100.0, threads=1)
+    assert len(limp["left"]) == 0 and "0 of 1 sequences" in play.push_report(limp, play.Push(100.0, 0.5))
+    with pytest.raises(UserError, match="no sequence is 31.0 s long"):
+        play.largest_push(char, ref, cheat, 30.0, 100.0)
+
+
 # ------------------------------------------------------------------------------------ what drives it
 
 
@@ -492,7 +540,7 @@ def test_measure_json(policy_file, tmp_path, capsys, monkeypatch):
 def test_split_and_all(policy_file, monkeypatch):
     asked = []
 
-    def sequences(motion, split, clips, seed):
+    def sequences(motion, split, clips, seed, reading):
         asked.append((motion, split, clips, seed))
         raise UserError("enough")
 
@@ -534,4 +582,4 @@ def test_what_cannot_be_done_is_said_first(policy_file, tmp_path):
         with pytest.raises(UserError, match=f"cannot write .*{name}: there is no folder"):
             play.main(["--policy", str(policy_file), "--measure", flag, str(tmp_path / "none" / name)])
     with pytest.raises(UserError, match="--sequence 7: there are 1, from 0"):
-        play.main(["--policy", str(policy_file), "--measure", "--sequence", "7", "--clips", "*gesture*"])
+        play.main(["--policy", str(policy_file), "--measure", "--sequence", "7", "--clips", "walk_005"])

@@ -210,8 +210,12 @@ def test_policy_loss_gradient():
         return ppo.policy_loss(policy, x[:, :5], action, logp_old, adv, 0.2)[0]
 
     check_gradient(f, theta, gradient, rtol=1e-6, atol=1e-9)
-    policy.theta_pi[:] = theta
+
+
+def test_policy_loss_gradient_against_torch():
     torch = pytest.importorskip("torch", reason="torch (extra torch) is compared with")
+    policy, x, action, logp_old, adv, _ = policy_batch()
+    gradient, theta = ppo.policy_loss(policy, x[:, :5], action, logp_old, adv, 0.2)[1], policy.theta_pi.copy()
     t = torch.tensor(theta, requires_grad=True)
     p = dict(zip(policy.actor.shapes, torch.split(t[:-3], [int(np.prod(s)) for s in policy.actor.shapes.values()])))
     h = torch.tensor(x[:, :5])
@@ -245,7 +249,7 @@ def test_critic_loss_gradient():
 
 
 def test_stored_action_is_unclipped(char, ref):
-    """The physics gets the clipped action; the ratio is of what the policy drew (design.md, mistake 3)."""
+    """The physics gets the clipped action; the ratio is of what the policy drew."""
     t = trainer_of(char, ref, sigma=1.5)
     given = []
     step = t.env.step
@@ -266,7 +270,7 @@ def test_stored_action_is_unclipped(char, ref):
 
 
 def test_bootstrap_is_before_the_reset(char, ref):
-    """Truncation: V of the observation before the reset.  Failure: 0.  Otherwise V(o_{t+1}) (design.md, mistake 1)."""
+    """Truncation: V of the observation before the reset.  Failure: 0.  Otherwise V(o_{t+1})."""
     t = trainer_of(char, ref, episode=3)
     twin = Env(char, ref, t.env.n, t.opt.seed, 1, 3)
     twin.reset(t.opt.seed)
@@ -585,7 +589,7 @@ def test_init_fine_tunes(whole, tmp_path, monkeypatch):
 
 
 def test_policy_round_trip(tmp_path, char, ref):
-    """What is played is what was trained: the normaliser is in the file, and frozen (design.md, mistake 2)."""
+    """What is played is what was trained: the normaliser is in the file, and frozen."""
     t = trainer_of(char, ref)
     t.collect(), t.update()
     t.save(tmp_path / CHECKPOINT, {"options": {"character": "jesse"}})

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import bvh
 import gait
 import mocap
 import render
@@ -278,7 +279,10 @@ MUTATIONS = [  # what, file, old text, new text, what the one line must say
     ("torque nan", TOML, "hip = 200.0", "hip = nan", ("[torque.base] hip", "nan", "finite")),
     ("scale group", TOML, "Elbow = 0.1", "Elbows = 0.1", ("[torque.scale]", "'elbows'", "elbow")),
     ("scale negative", TOML, "Elbow = 0.1", "Elbow = -0.1", ("[torque.scale] Elbow", "-0.1")),
-    ("no scale", TOML, "[torque.scale]", "[torque.sale]", ("[torque] has no scale", "base")),
+    ("unknown table", TOML, "[pose]", "[posse]", ("'posse'", "pose", "metrics")),
+    ("unknown key", TOML, "scale_xy = 1.0", "scale_yx = 1.0", ("[root]", "'scale_yx'", "scale_xy")),
+    ("unknown passive", TOML, "damping = 0.05", "damping = 0.05\nstifness = 3", ("[passive]", "'stifness'")),
+    ("no scale", TOML, "[torque.scale]", "[torque.sale]", ("[torque] has 'sale'", "base", "scale")),
     ("stiffness", TOML, "stiffness = { hip = 150.0, ", "stiffness = { ", ("[passive.stiffness]", "hip")),
     ("damping", TOML, "damping = 0.05", "damping = -0.05", ("[passive] damping", "-0.05")),
     ("armature", TOML, "hip = 0.05, ", "", ("[passive.armature]", "hip")),
@@ -718,7 +722,7 @@ def test_retarget_reproduces_segments_recorded(char, mocap_dir):
 
 
 def test_command_line(capsys, tmp_path):
-    retarget.main(["--clips", "0[02]*"])
+    retarget.main(["--clips", "*_00[57]"])
     out = capsys.readouterr().out.splitlines()
     assert len(out) == 4 and out[0].startswith("jesse: hips 0.900 m, 33 hinges, 33 driven, 60.0 kg")
     assert "walk_005" in out[1] and "mean of 2" in out[3]
@@ -729,3 +733,64 @@ def test_draw(char, clips):
     pose = retarget.retarget(char, clips[0])
     (image,) = retarget.draw(char, clips[0], pose, [10], (160, 120))
     assert image.shape == (120, 160, 3) and image.dtype == np.uint8 and image.std() > 10
+
+
+# ------------------------------------------------------------------------------------ export
+
+
+def exported(path, seconds=3.0):
+    """A walk's kinematic pose written as BVH.  -> character, pose, clip"""
+    char, clip = retarget.character("jesse"), clip_of("walk", seconds, turn_rate=0.5)
+    pose = retarget.retarget(char, clip)
+    retarget.write_bvh(path, char, pose.qpos, clip.rate)
+    return char, pose, clip
+
+
+def test_bvh_round_trip(tmp_path):
+    """Our reader's kinematics of the file are MuJoCo's of the motion: 1e-4 m, 1e-4 degrees."""
+    char, pose, clip = exported(tmp_path / "walk.bvh")
+    b, fk = bvh.read(tmp_path / "walk.bvh"), retarget.forward_kinematics(char, pose.qpos)
+    pos, quat = bvh.global_pose(b)
+    bodies = [char.model.body(n).id for n in b.names]
+    assert len(bodies) == char.model.nbody - 1 and b.frame_time == pytest.approx(1 / clip.rate)
+    to_file = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # x left, y up, z forward
+    np.testing.assert_allclose(pos / 100, fk.xpos[:, bodies] @ to_file.T, atol=1e-6)
+    turn = Rotation.from_matrix(to_file)
+    want = turn * Rotation.from_quat(fk.xquat[:, bodies].reshape(-1, 4), scalar_first=True) * turn.inv()
+    got = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True)
+    assert np.degrees((got * want.inv()).magnitude()).max() < 1e-4
+    assert set(b.end_sites) == {n for j, n in enumerate(b.names) if j not in b.parents}
+    assert all(np.linalg.norm(v) > 1.0 for v in b.end_sites.values())  # cm: importers drop bones without length
+    assert not b.offsets[0].any()  # adding the root's OFFSET or not is the same
+
+
+def test_bvh_is_a_human_again(tmp_path, capsys):
+    """The character's own file, read as a human of an unknown rig."""
+    char, pose, clip = exported(tmp_path / "walk.bvh")
+    got = mocap.from_bvh(tmp_path / "walk.bvh")
+    assert "unit cm" in capsys.readouterr().err
+    for s in ("thigh_l", "shin_r", "upper_arm_l", "forearm_r", "pelvis"):
+        assert np.degrees(mocap.quat_angle(got.quat, clip.quat))[:, mocap.SEG[s]].mean() < 8, s
+
+
+def test_bvh_in_another_library(tmp_path):
+    """bvhsdk reads the same positions."""
+    sdk = pytest.importorskip("bvhsdk")
+    char, pose, _ = exported(tmp_path / "walk.bvh", 0.5)
+    fk, other = retarget.forward_kinematics(char, pose.qpos), sdk.ReadFile(str(tmp_path / "walk.bvh"))
+    assert other.frames == len(pose.qpos)
+    for joint in other.getlistofjoints():
+        for t in (0, 7, len(pose.qpos) - 1):
+            want = 100 * fk.xpos[t, char.model.body(joint.name).id][[1, 2, 0]]
+            np.testing.assert_allclose(joint.getPosition(t), want, atol=1e-4)
+
+
+def test_bvh_refuses(tmp_path):
+    char, clip = retarget.character("jesse"), clip_of("walk", 0.2)
+    pose = retarget.retarget(char, clip)
+    with pytest.raises(UserError, match="cannot write"):
+        retarget.write_bvh(tmp_path / "nowhere" / "a.bvh", char, pose.qpos, clip.rate)
+    char.model.jnt_pos[5] = [0.0, 0.0, 0.1]
+    with pytest.raises(UserError, match="lies beside the body's origin"):
+        retarget.write_bvh(tmp_path / "a.bvh", char, pose.qpos, clip.rate)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,182 @@
+r"""The canonical human: 15 named segments, rotations as quaternions, one motion as a Clip.
+
+Every segment has a joint centre at its near end and an anatomical frame that equals the world's axes (x forward,
+y left, z up) when the person stands upright with the arms hanging.  Metres, radians, seconds; quaternions w, x, y, z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+SEGMENTS = (
+    "pelvis", "chest", "head",
+    "thigh_l", "shin_l", "foot_l", "thigh_r", "shin_r", "foot_r",
+    "upper_arm_l", "forearm_l", "hand_l", "upper_arm_r", "forearm_r", "hand_r",
+)  # fmt: skip
+PARENTS = (-1, 0, 1, 0, 3, 4, 0, 6, 7, 1, 9, 10, 1, 12, 13)
+SEG = {name: i for i, name in enumerate(SEGMENTS)}
+FEET = (SEG["foot_l"], SEG["foot_r"])
+CONTACT_HEIGHT, CONTACT_SPEED = 0.20, 0.40  # m, m/s  [Reda23 App. A]
+
+# ------------------------------------------------------------------------------------ quaternions
+
+
+def quat_mul(a, b):
+    """Hamilton product of quaternions w, x, y, z, (..., 4) each.  Test: test_mocap.py::test_quaternions."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(a), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(b), -1, 0)
+    return np.stack([
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    ], axis=-1)  # fmt: skip
+
+
+def quat_conj(q):
+    """Inverse of a unit quaternion.  (..., 4) -> (..., 4).  Test: test_mocap.py::test_quaternions."""
+    return np.asarray(q) * np.array([1, -1, -1, -1], dtype=np.asarray(q).dtype)
+
+
+def quat_rotate(q, v):
+    """Rotate vectors v (..., 3) by q = (w, u): v + 2 w (u×v) + 2 u×(u×v).  Test: test_mocap.py::test_quaternions."""
+    q, v = np.asarray(q), np.asarray(v)
+    u, w = q[..., 1:], q[..., :1]
+    t = 2.0 * np.cross(u, v)
+    return v + w * t + np.cross(u, t)
+
+
+def quat_matrix(q):
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4).  Test: test_mocap.py::test_quaternions."""
+    w, x, y, z = np.moveaxis(np.asarray(q), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(r, axis=-1) for r in rows], axis=-2)
+
+
+def quat_about(axis: int, angle):
+    """Turn by `angle` (...) about coordinate axis 0, 1 or 2 -> (..., 4).  Test: test_mocap.py::test_quaternions."""
+    angle = np.asarray(angle, dtype=float)
+    q = np.zeros(angle.shape + (4,))
+    q[..., 0], q[..., 1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
+    return q
+
+
+def quat_angle(a, b):
+    """Geodesic angle |log(a b⁻¹)| in [0, π]; q and −q are one rotation.  Test: test_mocap.py::test_quaternions."""
+    r = quat_mul(a, quat_conj(b))
+    return 2.0 * np.arctan2(np.linalg.norm(r[..., 1:], axis=-1), np.abs(r[..., 0]))
+
+
+def quat_slerp(a, b, t):
+    """Slerp along the shorter arc.  a, b (..., 4), t (...) in [0, 1].  Test: test_mocap.py::test_resample."""
+    dot = np.sum(a * b, axis=-1, keepdims=True)
+    b, dot = np.where(dot < 0, -b, b), np.minimum(np.abs(dot), 1.0)
+    t = np.asarray(t)[..., None]
+    theta = np.arccos(dot)
+    small = theta < 1e-6  # sin θ/θ → 1: linear interpolation is exact to 1e-12 there
+    s = np.where(small, 1.0, np.sin(theta))
+    wa = np.where(small, 1 - t, np.sin((1 - t) * theta) / s)
+    wb = np.where(small, t, np.sin(t * theta) / s)
+    q = wa * a + wb * b
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def quat_continuous(q):
+    """Signs such that consecutive frames lie in one hemisphere.  q (T, ..., 4).  Test: test_mocap.py::test_resample."""
+    flip = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=-1, keepdims=True) < 0, -1.0, 1.0), axis=0)
+    return np.concatenate([q[:1], q[1:] * flip])
+
+
+def angular_velocity(q, rate):
+    r"""World-frame angular velocity by central differences of log(q_{t+1} q_{t-1}⁻¹).
+
+    Equation  ω_t = log(q_{t+1} q_{t−1}^{-1}) / (2 Δt), one-sided at both ends
+    Args      q : (T, ..., 4); rate [Hz]
+    Returns   (T, ..., 3) [rad/s], world frame
+    Test      tests/test_mocap.py::test_velocities
+    """
+    nxt, prv = np.concatenate([q[1:], q[-1:]]), np.concatenate([q[:1], q[:-1]])
+    d = quat_mul(nxt, quat_conj(prv))
+    d = np.where(d[..., :1] < 0, -d, d)
+    s = np.linalg.norm(d[..., 1:], axis=-1, keepdims=True)
+    log = d[..., 1:] * np.where(s < 1e-9, 2.0, 2.0 * np.arctan2(s, d[..., :1]) / np.maximum(s, 1e-12))
+    return log * _span(len(q), rate).reshape((-1,) + (1,) * (q.ndim - 1))
+
+
+def linear_velocity(x, rate):
+    """Central differences of x (T, ...), one-sided at the ends, per second.  Test: test_mocap.py::test_velocities."""
+    nxt, prv = np.concatenate([x[1:], x[-1:]]), np.concatenate([x[:1], x[:-1]])
+    return (nxt - prv) * _span(len(x), rate).reshape((-1,) + (1,) * (x.ndim - 1))
+
+
+def _span(n, rate):
+    if n < 2:
+        return np.zeros(n)
+    s = np.full(n, rate / 2.0)
+    s[[0, -1]] = rate
+    return s
+
+
+def heading(q):
+    r"""Yaw of the heading frame: where the body's LEFT axis says forward is.
+
+    Equation  ψ = atan2(−l_x, l_y), l = q · (0, 1, 0)
+    Why       looking up or bending over turns about the left axis and leaves it alone, so the heading cannot flip;
+              the projected forward axis would
+    Args      q : (..., 4) root orientation, world frame
+    Returns   (...) [rad]
+    Test      tests/test_mocap.py::test_heading_does_not_flip
+    """
+    w, x, y, z = np.moveaxis(np.asarray(q), -1, 0)
+    return np.arctan2(-2 * (x * y - w * z), 1 - 2 * (x * x + z * z))
+
+
+# ------------------------------------------------------------------------------------ the canonical human
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A motion of the canonical human.
+
+    name  : where it comes from
+    body  : whose body it is (from a file: rig or subject, and limb lengths); only clips of one body are stitched
+    rate  : frames a second
+    pos   : (T, 15, 3) joint centre at the near end of each segment [m], world; pelvis: midpoint of the hip joints
+    quat  : (T, 15, 4) anatomical frame of each segment -> world
+    ball  : (T, 2, 3) ball of the left and the right foot [m], world
+    """
+
+    name: str
+    body: str
+    rate: float
+    pos: np.ndarray
+    quat: np.ndarray
+    ball: np.ndarray
+
+    def __len__(self):
+        return len(self.pos)
+
+    @property
+    def seconds(self):
+        return len(self.pos) / self.rate
+
+    def __getitem__(self, s: slice) -> Clip:
+        return replace(self, pos=self.pos[s], quat=self.quat[s], ball=self.ball[s])
+
+    def limb(self, a: str, b: str) -> float:
+        """Mean distance between two joint centres [m]."""
+        return float(np.linalg.norm(self.pos[:, SEG[a]] - self.pos[:, SEG[b]], axis=-1).mean())
+
+    @property
+    def hip_height(self) -> float:
+        """Height of the hips when standing straight [m]: thigh + shin + the ankle's lowest height, both legs' mean.
+        The ankle's 5th percentile, because the lowest frame of a real recording is noise."""
+        leg = [self.limb(f"thigh_{s}", f"shin_{s}") + self.limb(f"shin_{s}", f"foot_{s}") for s in "lr"]
+        ankle = np.percentile(self.pos[:, FEET, 2], 5, axis=0)
+        return float(np.mean(leg) + np.mean(ankle))

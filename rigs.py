@@ -1,0 +1,862 @@
+r"""Capture rigs: which joint is which segment, and how its axes stand  [Reda23 §3.4].
+
+    known joint names ──────► RIGS, CMU_BONES        axes read off standing frames, once
+    any other names ────────► guess or joint map ──► measure: axes from positions and from the motion
+
+A rig's rest pose says nothing here (it may be a T-pose, or bones along x): for an unknown rig the axes are measured.
+
+    joint map, TOML           left out: guessed from the names
+    unit = "cm"               m, cm, mm, in, cmu (0.0254/0.45 m), or metres a unit; left out: from the body's size
+    up = "y"                  x, y, z, -x, -y or -z; left out: from where the head is
+    balls = ["LeftToe", "RightToe"]
+    [joints]
+    pelvis = "Hips"           a joint, or JOINT.end for its End Site; all 15 segments of `human.SEGMENTS`
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import tomllib
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import amc
+import bvh
+from human import (
+    CONTACT_HEIGHT,
+    CONTACT_SPEED,
+    FEET,
+    PARENTS,
+    SEG,
+    SEGMENTS,
+    Clip,
+    linear_velocity,
+    quat_about,
+    quat_conj,
+    quat_continuous,
+    quat_mul,
+    quat_rotate,
+)
+from runs import UserError
+
+# ------------------------------------------------------------------------------------ known rigs
+
+
+@dataclass(frozen=True)
+class Rig:
+    """How one capture skeleton maps to the canonical human.
+
+    joints : segment -> joint of the file.  pelvis is placed at the midpoint of the thighs' joints
+    axes   : segment -> (forward, left, up) in the joint's own frame when standing, each as "-z" or a vector
+    pitch  : segment -> degrees by which the joint's forward axis points down when standing; taken out
+    balls  : the joints at the balls of the feet, left and right
+    """
+
+    joints: dict
+    axes: dict
+    balls: tuple
+    pitch: dict = field(default_factory=dict)
+    unit: float = 0.01  # file unit in metres
+    signature: tuple = ()
+    up: str = "y"  # the file's axis that points up
+
+    def calibration(self, segment: str) -> np.ndarray:
+        """Constant rotation anatomical frame -> joint frame (4,).  Test: test_mocap.py::test_rigs_stand_upright."""
+        cols = np.stack([_axis(a) for a in self.axes[segment]], axis=1)  # (3, 3): forward, left, up as columns
+        q = Rotation.from_matrix(cols).as_quat(scalar_first=True)
+        return quat_mul(q, quat_about(1, np.radians(-self.pitch.get(segment, 0.0))))
+
+
+def _axis(a):
+    """ "-z" -> (0, 0, -1); a vector passes through, made unit length."""
+    if isinstance(a, str):
+        v = np.zeros(3)
+        v["xyz".index(a[-1])] = -1.0 if a[0] == "-" else 1.0
+        return v
+    return np.asarray(a, dtype=float) / np.linalg.norm(a)
+
+
+def _frame(left, up):
+    """(forward, left, up) from a left axis made orthogonal to up."""
+    left, up = _axis(left), _axis(up)
+    left = left - up * (left @ up)
+    left /= np.linalg.norm(left)
+    return np.cross(left, up), left, up
+
+
+def _limbs(frames: dict) -> dict:
+    """Spread one frame a limb over its segments, and both sides."""
+    out = {}
+    for limb, (left_side, right_side) in frames.items():
+        for segment in {"leg": ("thigh", "shin"), "arm": ("upper_arm", "forearm", "hand"), "foot": ("foot",)}[limb]:
+            out[f"{segment}_l"], out[f"{segment}_r"] = left_side, right_side
+    return out
+
+
+# Axes were read off standing and walking frames: the bones lie along local x in both rigs, knees and elbows turn about
+# one local axis.  Pitches: the foot's bone slopes down to the ball by this much when the foot is flat; the Bandai head
+# looks down by this much in the mean over `walk_normal`, where people look ahead (ASSUMED).
+RIGS = {
+    "bandai": Rig(
+        signature=("joint_Root", "Hips", "UpperLeg_L", "LowerArm_R"),
+        joints=dict(
+            pelvis="Hips", chest="Chest", head="Head",
+            thigh_l="UpperLeg_L", shin_l="LowerLeg_L", foot_l="Foot_L",
+            thigh_r="UpperLeg_R", shin_r="LowerLeg_R", foot_r="Foot_R",
+            upper_arm_l="UpperArm_L", forearm_l="LowerArm_L", hand_l="Hand_L",
+            upper_arm_r="UpperArm_R", forearm_r="LowerArm_R", hand_r="Hand_R",
+        ),  # fmt: skip
+        balls=("Toes_L", "Toes_R"),
+        axes=dict(
+            pelvis=("z", "-y", "x"),
+            chest=("y", "z", "x"),
+            head=("y", "z", "x"),
+            **_limbs(dict(
+                leg=(("z", "y", "-x"), ("-z", "y", "x")),
+                arm=(("z", "y", "-x"), ("-z", "y", "x")),
+                foot=(("x", "y", "z"), ("-x", "y", "-z")),
+            )),
+        ),
+        pitch=dict(foot_l=39.6, foot_r=39.6, head=12.6),
+    ),
+    "lafan1": Rig(
+        signature=("Hips", "LeftUpLeg", "Spine2", "LeftForeArm", "LeftToe"),
+        joints=dict(
+            pelvis="Hips", chest="Spine2", head="Head",
+            thigh_l="LeftUpLeg", shin_l="LeftLeg", foot_l="LeftFoot",
+            thigh_r="RightUpLeg", shin_r="RightLeg", foot_r="RightFoot",
+            upper_arm_l="LeftArm", forearm_l="LeftForeArm", hand_l="LeftHand",
+            upper_arm_r="RightArm", forearm_r="RightForeArm", hand_r="RightHand",
+        ),  # fmt: skip
+        balls=("LeftToe", "RightToe"),
+        axes=dict(
+            pelvis=("y", "z", "x"),
+            chest=("y", "z", "x"),
+            head=("y", "z", "x"),
+            **_limbs(dict(
+                leg=(("y", "-z", "-x"), ("y", "-z", "-x")),
+                # the elbows' axis in the arms' frames, the mean of upper arm × forearm over the clip
+                arm=(_frame((0, 0.34, 0.94), "-x"), _frame((0, -0.38, 0.92), "-x")),
+                foot=(("x", "-z", "y"), ("x", "-z", "y")),
+            )),
+        ),
+        pitch=dict(foot_l=25.8, foot_r=25.8),
+    ),
+}  # fmt: skip
+
+# ------------------------------------------------------------------------------------ units and axes of a file
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "cmu": 0.0254 / 0.45}
+UPS = ("x", "y", "z", "-x", "-y", "-z")
+HIPS = (0.6, 1.2)  # m, height of a standing adult's hips; its ends' ratio is less than that of any two units
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a user says about files, over what is known, guessed or measured; None: nothing.
+
+    Raises    UserError: a unit or an axis that is none
+    Test      tests/test_rigs.py::test_overrides, ::test_bad_joint_maps
+    """
+
+    joint_map: str | None = None
+    unit: str | None = None
+    up: str | None = None
+
+    def __post_init__(self):
+        _unit("--unit", self.unit)
+        _up("--up", self.up)
+
+    @classmethod
+    def of(cls, options) -> Reading:
+        """The same three of a command's options."""
+        return cls(options.joint_map, options.unit, options.up)
+
+
+HELP = {  # of the flags that every command with --motion has
+    "joint_map": "TOML file that says which joint is which segment, for BVH files of rigs that are neither known nor "
+    "guessed",
+    "unit": "length unit of the BVH files: m, cm, mm, in, cmu, or metres a unit; found from the body's size by default",
+    "up": "axis of the BVH files that points up: x, y, z, or --up=-z; found from the body by default",
+}
+
+
+def _unit(where, value) -> float | None:
+    """Metres a unit."""
+    if value is None or value in UNITS:
+        return UNITS.get(value)
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if isinstance(value, bool) or not 0.0 < number < np.inf:
+        raise UserError(f"{where} {value!r} is no unit; valid: {', '.join(UNITS)}, or metres a unit as a number")
+    return number
+
+
+def _up(where, value) -> str | None:
+    if value is not None and value not in UPS:
+        raise UserError(f"{where} {value!r} is no axis; valid: {', '.join(UPS)}")
+    return value
+
+
+AS_IT_IS = Reading()
+
+
+@cache
+def _from_file(up: str):
+    """File axes -> ours: (permutation, signs, the same turn as a quaternion).  A cyclic permutation puts the up axis
+    last (from y up: x left, y up, z forward); an axis that points down is then turned over about ours x."""
+    k = "xyz".index(up[-1])
+    half = [(0.5, -0.5, -0.5, -0.5), (0.5, 0.5, 0.5, 0.5), (1.0, 0.0, 0.0, 0.0)][k]
+    turn, signs = np.array(half), np.ones(3)
+    if up[0] == "-":
+        turn, signs = quat_mul(np.array([0.0, 1.0, 0.0, 0.0]), turn), np.array([1.0, -1.0, -1.0])
+    return [(k + 1) % 3, (k + 2) % 3, k], signs, turn
+
+
+# ------------------------------------------------------------------------------------ reading a file
+
+
+def rig_of(b: bvh.Bvh) -> str | None:
+    """Name of the known rig whose joints the file has, or None.  Test: tests/test_mocap.py::test_unknown_rig."""
+    for name, rig in RIGS.items():
+        if set(rig.signature) | set(rig.balls) | set(rig.joints.values()) <= set(b.names):
+            return name
+    return None
+
+
+def from_bvh(path, reading=AS_IT_IS) -> Clip:
+    """Read a BVH as the canonical human, at the file's own rate.
+
+    Symbols   p = u·P(p_file), q = q_up q_file C: unit u, axes P and q_up, calibration C of the rig
+    Frame     world, floor at z = 0, metres
+    Raises    UserError: cannot be opened, not a BVH, or a skeleton that neither is known nor can be guessed
+    Test      tests/test_mocap.py::test_bvh_against_scipy, ::test_root_offset
+    """
+    return read_clips([path], reading)[0]
+
+
+SAMPLE = 20  # files of a folder from which an unknown rig is measured, evenly spread over the names
+
+
+def read_clips(paths, reading=AS_IT_IS, among=None) -> list[Clip]:
+    """Read files; an unknown rig is guessed and measured once for all files that share a skeleton, and printed.
+
+    Args      among : the folder's files, from which it is measured whatever is read: the parts of a split must not
+              see different axes.  Default: paths
+    Raises    UserError: as `from_bvh`, `from_amc`
+    Test      tests/test_rigs.py::test_folder_is_measured_once
+    """
+    among = list(among or paths)
+    measured, sampled = {}, None
+    out = []
+    for path in paths:
+        if is_amc(path):
+            out.append(from_amc(path))
+            continue
+        b = read(path)
+        known = None if reading.joint_map else rig_of(b)
+        if known:
+            out.append(canonical(b, *rig_for(b, reading)))
+            continue
+        key = _skeleton(b)
+        if key not in measured:
+            if sampled is None:
+                files = [f for f in among if not is_amc(f)]
+                sampled = list(filter(None, map(_read_or_none, files[:: -(-len(files) // SAMPLE)])))
+            measured[key] = rig_for(b, reading, [s for s in sampled if _skeleton(s) == key] or [b])
+        out.append(canonical(b, *measured[key]))
+    return out
+
+
+def _skeleton(b):
+    """What files of one skeleton have in common: all but the root's OFFSET."""
+    return b.names, tuple(b.parents), np.round(b.offsets[1:], 3).tobytes()
+
+
+def read(path) -> bvh.Bvh:
+    """A BVH file as it stands; UserError if there is none.  Test: tests/test_cli.py::test_broken_motion."""
+    try:
+        return bvh.read(path)
+    except bvh.BvhError as e:
+        raise UserError(str(e)) from None
+    except OSError as e:
+        raise UserError(f"{path}: {e.strerror or e}; expected a .bvh file") from None
+
+
+def _read_or_none(path):
+    try:
+        return read(path)
+    except UserError:
+        return None  # told when it is its turn
+
+
+def is_amc(path) -> bool:
+    """Whether a path's name is an AMC file's.  Test: tests/test_amc.py::test_body_split."""
+    return Path(path).suffix.lower() == ".amc"
+
+
+def rig_for(b: bvh.Bvh, reading=AS_IT_IS, group=None):
+    """(Rig, its name) of a file: known, or guessed and measured over a group of files of the same skeleton.
+
+    Test      tests/test_rigs.py::test_any_rig, ::test_overrides
+    """
+    known = None if reading.joint_map else rig_of(b)
+    if not known:
+        return _unknown(group or [b], reading)
+    rig, unit, up = RIGS[known], _unit("--unit", reading.unit), reading.up
+    return replace(rig, unit=unit or rig.unit, up=up or rig.up), known
+
+
+FLOOR_LIMIT, BALL_HEIGHT = 0.15, 0.02  # m: beyond the one a file has no floor at 0; the other is a standing ball's
+
+
+def canonical(b: bvh.Bvh, rig: Rig, name: str) -> Clip:
+    """A file in a rig -> the canonical human.  Test: tests/test_mocap.py::test_root_offset, test_rigs.py::test_floor"""
+    pose = _clip_of(b, rig, name, "replace")
+    root = b.parents.argmin()
+    if np.any(b.offsets[root]) and any("position" in c for c in b.channels[root]):
+        # Some exporters add the root's OFFSET to its channels, most do not: right is what puts the feet on the floor.
+        added = _clip_of(b, rig, name, "add")
+        if abs(_lowest(added)) < abs(_lowest(pose)):
+            pose = added
+    if name not in RIGS and abs(low := _lowest(pose)) > FLOOR_LIMIT:
+        print(f"{b.path}: the balls of the feet stand at {low:.2f} m: moved to the floor", file=sys.stderr)
+        down = np.array([0.0, 0.0, low - BALL_HEIGHT])
+        pose = replace(pose, pos=pose.pos - down, ball=pose.ball - down)
+    return replace(pose, body=_body(name, pose))
+
+
+def _body(rig: str, clip: Clip) -> str:
+    """Whose body: the rig and the lengths of leg and arm [cm], so that two people in one rig are two bodies."""
+    leg = clip.limb("thigh_l", "shin_l") + clip.limb("shin_l", "foot_l")
+    arm = clip.limb("upper_arm_l", "forearm_l") + clip.limb("forearm_l", "hand_l")
+    return f"{rig}-leg{100 * leg:.0f}-arm{100 * arm:.0f}"
+
+
+def _lowest(clip):
+    return np.percentile(clip.ball[..., 2].min(axis=1), 20)
+
+
+def _pose(b, root_offset="replace"):
+    """Names, positions and rotations of joints and, as JOINT.end, of End Sites.  File units and axes."""
+    pos, quat = bvh.global_pose(b, root_offset)
+    at = [b.names.index(n) for n in b.end_sites]
+    ends = pos[:, at] + quat_rotate(quat[:, at], np.array(list(b.end_sites.values())).reshape(-1, 3))
+    names = (*b.names, *(f"{n}.end" for n in b.end_sites))
+    return names, np.concatenate([pos, ends], axis=1), np.concatenate([quat, quat[:, at]], axis=1)
+
+
+def _clip_of(b, rig, name, root_offset):
+    calibrations = np.stack([rig.calibration(s) for s in SEGMENTS])
+    if any(n.endswith(".end") for n in (*rig.joints.values(), *rig.balls)):
+        pose = _pose(b, root_offset)
+    else:
+        pose = (b.names, *bvh.global_pose(b, root_offset))
+    return _human(rig, calibrations, *pose, Path(b.path).stem, name, 1.0 / b.frame_time)
+
+
+def _human(rig, calibrations, names, pos, quat, clip, body, rate):
+    """The canonical human in a file's joints (file units and axes)."""
+    index = {n: i for i, n in enumerate(names)}
+    cols = [index[rig.joints[s]] for s in SEGMENTS]
+    order, signs, turn = _from_file(rig.up)
+    p = pos[..., order] * (signs * rig.unit)
+    q = quat_mul(turn, quat_mul(quat[:, cols], calibrations))
+    joint_pos = p[:, cols].copy()
+    joint_pos[:, 0] = 0.5 * (joint_pos[:, SEG["thigh_l"]] + joint_pos[:, SEG["thigh_r"]])
+    ball = p[:, [index[n] for n in rig.balls]]
+    return Clip(clip, body, rate, joint_pos, quat_continuous(q), ball)
+
+
+# ------------------------------------------------------------------------------------ which joint is which segment
+
+_WORDS = {  # what joints are called, side and decoration apart; the first that is there counts
+    "thigh": ("upleg", "upperleg", "thigh", "femur", "hip"),
+    "shin": ("lowerleg", "lowleg", "shin", "calf", "tibia", "knee", "leg"),
+    "foot": ("ankle", "foot"),
+    "ball": ("toebase", "toe", "toes", "ball", "foot"),
+    "upper_arm": ("upperarm", "uparm", "humerus", "arm", "shldr", "shoulder"),
+    "forearm": ("forearm", "lowerarm", "lowarm", "radius", "elbow"),
+    "hand": ("wrist", "hand"),
+}
+_LEG, _ARM = ("thigh", "shin", "foot", "ball"), ("upper_arm", "forearm", "hand")
+_SIDES = {"l": "l", "left": "l", "r": "r", "right": "r"}
+_DECORATION = {
+    "joint",
+    "jnt",
+    "bone",
+    "bip",
+    "biped",
+    "mixamorig",
+    "def",
+    "org",
+    "character",
+    "rig",
+    "b",
+    "j",
+    "m",
+    "avg",
+}
+
+
+def read_name(name: str):
+    """A joint's name -> (side "l", "r" or "", word): "mixamorig:LeftUpLeg" is (l, upleg), "lThigh" (l, thigh).
+
+    Test      tests/test_rigs.py::test_names
+    """
+    parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name.rsplit(":", 1)[-1])
+    words = [w for w in map(str.lower, parts) if w not in _DECORATION]
+    side = next((_SIDES[w] for w in words if w in _SIDES), "")
+    word = "".join(w for w in words if w not in _SIDES)
+    if not side:
+        known = {w for each in _WORDS.values() for w in each}
+        for pattern in (r"(left|right)(.+)", r"(l|r)(.+)"):  # without capitals: "leftupleg", "lfemur"
+            found = re.fullmatch(pattern, word)
+            if found and found[2] in known:
+                return _SIDES[found[1]], found[2]
+    return side, word
+
+
+def guess(b: bvh.Bvh, joints=None, balls=None):
+    """Which joint is which segment, from names along the limbs; the trunk is where the limbs meet.
+
+    Args      joints : segment -> joint, and balls : (left, right) or None: what is known already
+    Returns   joints, balls : completed as far as possible;  missing : segments (and ball_l, ball_r) that were not found
+    Test      tests/test_rigs.py::test_any_rig, ::test_partial_joint_map
+    """
+    joints = dict(joints or {})
+    named = [read_name(n) for n in b.names]
+    above = {-1: set()}
+    for j, p in enumerate(b.parents):
+        above[j] = above[p] | {j}
+    index = {n: j for j, n in enumerate(b.names)} | {f"{n}.end": b.names.index(n) for n in b.end_sites}
+    for side, ball in zip("lr", balls or (None, None)):
+        if ball:
+            joints[f"ball_{side}"] = ball
+        for limb in (_LEG, _ARM):
+            top = set()
+            for part in limb:
+                key = f"{part}_{side}"
+                fits = [
+                    j
+                    for word in _WORDS[part]
+                    for j, name in enumerate(named)
+                    if name == (side, word) and top < above[j] and b.names[j] not in joints.values()
+                ]
+                if key not in joints and fits:
+                    joints[key] = b.names[fits[0]]
+                if key in joints:
+                    top = above[index[joints[key]]]
+        foot = joints.get(f"foot_{side}")
+        if foot and f"ball_{side}" not in joints:  # toes of another name: the foot's only child, or where it ends
+            children = [n for n, p in zip(b.names, b.parents) if b.names[p] == foot and p >= 0]
+            if len(children) == 1:
+                joints[f"ball_{side}"] = children[0]
+            elif np.linalg.norm(b.end_sites.get(foot, np.zeros(3))) > 0:
+                joints[f"ball_{side}"] = f"{foot}.end"
+    for part, limb in (("pelvis", "thigh"), ("chest", "upper_arm")):
+        pair = [joints.get(f"{limb}_{side}") for side in "lr"]
+        if part not in joints and all(pair):
+            meet = set.intersection(*(above[index[n]] - {index[n]} for n in pair))
+            if meet and b.names[max(meet)] not in joints.values():
+                joints[part] = b.names[max(meet)]
+    trunk = above[index[joints["chest"]]] if "chest" in joints else set()
+    heads = [j for j, (side, word) in enumerate(named) if not side and word.endswith("head") and trunk < above[j]]
+    if "head" not in joints and heads:
+        joints["head"] = b.names[min(heads, key=lambda j: named[j][1] != "head")]
+    balls = tuple(joints.pop(f"ball_{side}", None) for side in "lr")
+    missing = [s for s in SEGMENTS if s not in joints] + [f"ball_{s}" for s, n in zip("lr", balls) if not n]
+    return {s: joints[s] for s in SEGMENTS if s in joints}, balls, missing
+
+
+def read_map(path):
+    """A joint map -> its tables, checked as far as no file is needed: {"joints": …, "unit": …, "up": …, "balls": …}.
+
+    Raises    UserError: the file, the key, and what would be valid
+    Test      tests/test_rigs.py::test_bad_joint_maps
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as e:
+        raise UserError(f"{path}: {e.strerror or e}; expected a joint map (TOML)") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+        raise UserError(f"{path}: no TOML: {e}") from None
+    for key in table:
+        if key not in ("joints", "unit", "up", "balls"):
+            raise UserError(f"{path}: unknown key {key!r}; valid: unit, up, balls, [joints]")
+    joints, balls = table.get("joints", {}), table.get("balls")
+    if not isinstance(joints, dict):
+        raise UserError(f"{path}: joints = {joints!r} is no table; write [joints]")
+    for key, value in joints.items():
+        if key not in SEGMENTS:
+            raise UserError(f"{path}: [joints] {key!r} is no segment; valid: {', '.join(SEGMENTS)}")
+        if not isinstance(value, str):
+            raise UserError(f"{path}: [joints] {key} = {value!r}; expected the name of a joint")
+    if balls is not None and not (
+        isinstance(balls, list) and len(balls) == 2 and all(isinstance(n, str) for n in balls)
+    ):
+        raise UserError(f"{path}: balls = {balls!r}; expected the names of two joints, left and right")
+    _unit(f"{path}: unit", table.get("unit"))
+    _up(f"{path}: up", table.get("up"))
+    return table
+
+
+def blank_map(b: bvh.Bvh, joints, balls, missing) -> str:
+    """A joint map to fill in: what was guessed, and a gap for what was not.  Test: test_rigs.py::test_unknown_rig."""
+    quote = lambda name: '"' + (name or "").replace("\\", "\\\\").replace('"', '\\"') + '"'  # noqa: E731
+    lines = [f"# joint map of {b.path}; its joints, and with .end their End Sites:"]
+    lines += [f"#   {'  ' * depth}{name}" for name, depth in zip(b.names, _depths(b))]
+    lines += [f"balls = [{quote(balls[0])}, {quote(balls[1])}]  # of the feet, left and right", "", "[joints]"]
+    lines += [f"{s} = {quote(joints.get(s))}" + ("  # ?" if s in missing else "") for s in SEGMENTS]
+    return "\n".join(lines)
+
+
+def _depths(b):
+    depth = []
+    for parent in b.parents:
+        depth.append(depth[parent] + 1 if parent >= 0 else 0)
+    return depth
+
+
+def _check_map(source, b, joints, balls):
+    """Names that are there, none twice, limbs in order; segments without a name and balls that are None are passed."""
+    valid = {*b.names, *(f"{n}.end" for n in b.end_sites)}
+    used = {}
+    for key, name in [*joints.items(), *((f"ball_{s}", n) for s, n in zip("lr", balls) if n)]:
+        if name not in valid:
+            raise UserError(f"{source}: {key} = {name!r} is no joint of {b.path}; valid: {', '.join(b.names)}")
+        if name in used:
+            raise UserError(f"{source}: {key} and {used[name]} are both {name!r}; expected joints of their own")
+        used[name] = key
+    for segment, parent in zip(SEGMENTS[3:], PARENTS[3:]):
+        low, high = (joints.get(s, "").removesuffix(".end") for s in (segment, SEGMENTS[parent]))
+        if parent > 1 and low and high:
+            j = b.names.index(low)
+            while j >= 0 and b.names[j] != high:
+                j = b.parents[j]
+            if j < 0:
+                raise UserError(f"{source}: {segment} = {low!r} does not hang from {SEGMENTS[parent]} = {high!r}")
+
+
+# ------------------------------------------------------------------------------------ how the axes stand
+
+
+def _unknown(group, reading):
+    """(Rig, name) for files of one skeleton that is in no table."""
+    b, table = group[0], read_map(reading.joint_map) if reading.joint_map else {}
+    source = reading.joint_map or b.path
+    given, ends = table.get("joints", {}), table.get("balls")
+    _check_map(source, b, given, ends or (None, None))
+    joints, balls, missing = guess(b, given, ends)
+    _check_map(source, b, joints, balls)
+    if missing:
+        print(blank_map(b, joints, balls, missing))
+        raise UserError(
+            f"{b.path}: unknown skeleton, and no guess for {', '.join(missing)} among its joints {', '.join(b.names)}; "
+            f"known: {', '.join((*RIGS, 'cmu'))}; fill in the joint map printed above and give it as --joint-map FILE"
+        )
+    pairs = [
+        f"{s} <- {n}"
+        for s, n in [*joints.items(), *zip(("ball_l", "ball_r"), balls)]
+        if s not in given and not (ends and s[:4] == "ball")
+    ]
+    say = lambda text: print(f"{b.path}: {text}", file=sys.stderr)  # noqa: E731
+    if pairs:
+        say(f"rig guessed from the joints' names: {', '.join(pairs)}")
+
+    poses = [_pose(each) for each in group]
+    names = poses[0][0]
+    at = [names.index(n) for n in (*joints.values(), *balls)]
+    pos = np.concatenate([p[:, at] for _, p, _ in poses])
+    up, unit = reading.up or table.get("up"), _unit("", reading.unit or table.get("unit"))
+    if not up:
+        up, share = find_up(b.path, pos)
+        say(f"{up} is up: the head is above the feet along it in {100 * share:.0f} % of the frames")
+    order, signs, _ = _from_file(up)
+    pos = pos[..., order] * signs
+    if not unit:
+        unit, name, hips = find_unit(b.path, pos)
+        say(f"unit {name}: the hips of a standing adult are 0.6 to 1.2 m high, these {hips:.2f} m")
+    rig = Rig(joints, {}, balls, unit=unit, up=up)
+    human = [
+        _human(rig, np.tile([1.0, 0, 0, 0], (15, 1)), *p, "", "", 1.0 / e.frame_time) for p, e in zip(poses, group)
+    ]
+    axes, notes = measure(b.path, human, [_fingers(b, rig, p) for p in poses])
+    for note in notes:
+        say(note)
+    return replace(rig, axes=axes), Path(reading.joint_map).stem if reading.joint_map else "guessed"
+
+
+def find_up(path, pos):
+    """The axis along which the head is above the feet.
+
+    Args      pos : (T, 17, 3) segments' joints and balls of the feet, in the file's axes
+    Returns   axis, share of the frames in which it is the steepest
+    Raises    UserError: the body lies, or turns over, too much to tell
+    Test      tests/test_rigs.py::test_units_and_up
+    """
+    v = pos[:, SEG["head"]] - pos[:, FEET].mean(axis=1)
+    v = v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
+    mean = v.mean(axis=0)
+    k = int(np.abs(mean).argmax())
+    up = ("-" if mean[k] < 0 else "") + "xyz"[k]
+    share = float(np.mean((np.abs(v).argmax(axis=1) == k) & (np.sign(v[:, k]) == np.sign(mean[k]))))
+    if abs(mean[k]) < 0.6:
+        raise UserError(f"{path}: no axis along which the head is above the feet; give --up (valid: {', '.join(UPS)})")
+    return up, share
+
+
+def find_unit(path, pos):
+    """The unit in which the hips are as high as a standing adult's.
+
+    Args      pos : (T, 17, 3) segments' joints and balls of the feet, z up, file units
+    Returns   metres a unit, its name, hip height [m]: thigh + shin + the ankle's height over the ball
+    Raises    UserError: no unit fits
+    Test      tests/test_rigs.py::test_units_and_up
+    """
+    length = lambda a, b: np.linalg.norm(pos[:, SEG[a]] - pos[:, SEG[b]], axis=-1).mean()  # noqa: E731
+    legs = np.mean([length(f"thigh_{s}", f"shin_{s}") + length(f"shin_{s}", f"foot_{s}") for s in "lr"])
+    low = np.percentile(pos[:, [*FEET, 15, 16], 2], 5, axis=0)
+    hips = legs + max(float(np.mean(low[:2] - low[2:])), 0.0)
+    for name, unit in UNITS.items():
+        if HIPS[0] <= hips * unit <= HIPS[1]:
+            return unit, name, hips * unit
+    raise UserError(
+        f"{path}: the hips are {hips:.4g} file units high, in none of {', '.join(UNITS)} an adult's 0.6 to 1.2 m; "
+        "give --unit (one of these, or metres a unit)"
+    )
+
+
+def _fingers(b, rig, pose):
+    """(T, 2, 3) where the hands point to: the mean of what hangs from the wrist, thumbs apart; NaN for nothing."""
+    names, pos, _ = pose
+    order, signs, _ = _from_file(rig.up)
+    out = np.full((len(pos), 2, 3), np.nan)
+    for k, hand in enumerate((rig.joints["hand_l"], rig.joints["hand_r"])):
+        children = [j for j, p in enumerate(b.parents) if p >= 0 and b.names[p] == hand]
+        ends = [j for j in children if "thumb" not in b.names[j].lower()] or [
+            j for j, n in enumerate(names) if n == f"{hand}.end"
+        ]
+        p = pos[:, ends].mean(axis=1) if ends else out[:, k]
+        if not np.allclose(p, pos[:, names.index(hand)], atol=1e-6):
+            out[:, k] = p[:, order] * (signs * rig.unit)
+    return out
+
+
+def measure(path, human, fingers):
+    r"""Axes of an unknown rig's joints, without its rest pose.
+
+    Method    every direction below is taken in the world, turned into the joint's own frame and averaged over the clip.
+              Limbs: up is against the bone; left is the axis about which knee and elbow bend, d₁×d₂ of the two bones
+              (knee) or against it (elbow), so weighted by the sine of the flexion.  Pelvis and chest: up from
+              mid-hips to mid-shoulders, left from hip to hip or shoulder to shoulder.  Foot: up is the world's while
+              heel and ball stand, forward from ankle to ball.  Hand: up against the fingers, left the forearm's
+    ASSUMED   in the mean of the upright frames the trunk is straight and the head looks ahead, level, where the chest
+              faces; the wrist is straight and not twisted.  Limbs that never bend (less than 10 degrees in nine frames
+              of ten, or to all sides) have the left axis of hips or shoulders, brought along the shortest way
+    Args      human : Clips with the joints' own rotations; fingers : (T, 2, 3) each, NaN without
+    Returns   segment -> (forward, left, up) in the joint's frame; what had to be assumed beyond that: a list of lines
+    Raises    UserError: left and right are swapped
+    Test      tests/test_rigs.py::test_any_rig, ::test_limbs_that_never_bend, ::test_known_rigs_measured
+    """
+    pos, quat = np.concatenate([c.pos for c in human]), np.concatenate([c.quat for c in human])
+    ball, fingers = np.concatenate([c.ball for c in human]), np.concatenate(fingers)
+    unit = lambda v: v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)  # noqa: E731
+    between = lambda a, b: unit(pos[:, SEG[b]] - pos[:, SEG[a]])  # noqa: E731
+    axes, notes, vertical = {}, [], np.array([0.0, 0.0, 1.0])
+
+    def local(segment, v, use=slice(None)):
+        """Mean of world vectors in a joint's own frame."""
+        q = quat[use, SEG[segment]]
+        return quat_rotate(quat_conj(q), np.broadcast_to(v, (len(quat), 3))[use]).mean(axis=0)
+
+    hips = 0.5 * (pos[:, SEG["thigh_l"]] + pos[:, SEG["thigh_r"]])
+    shoulders = 0.5 * (pos[:, SEG["upper_arm_l"]] + pos[:, SEG["upper_arm_r"]])
+    trunk, across = unit(shoulders - hips), {"pelvis": between("thigh_r", "thigh_l")}
+    across["chest"] = between("upper_arm_r", "upper_arm_l")
+    toes = unit((ball - pos[:, FEET]).mean(axis=1))
+    if np.mean(np.sum(toes * np.cross(across["pelvis"], trunk), axis=-1)) < 0:
+        raise UserError(f"{path}: the toes point backwards: left and right are swapped in the joint map or mirrored")
+    upright = trunk[:, 2] > np.cos(np.radians(30))
+    if upright.mean() < 0.1:
+        upright[:] = True
+        notes.append("the trunk is upright in fewer than a tenth of the frames: head and trunk are measured in all")
+    for segment in ("pelvis", "chest"):
+        axes[segment] = _frame(local(segment, across[segment], upright), local(segment, trunk, upright))
+    axes["head"] = _frame(local("head", across["chest"], upright), local("head", vertical, upright))
+
+    for k, side in enumerate("lr"):
+        for upper, lower, end, sign, base in (
+            ("thigh", "shin", "foot", 1.0, "pelvis"),
+            ("upper_arm", "forearm", "hand", -1.0, "chest"),
+        ):
+            upper, lower, end = (f"{s}_{side}" for s in (upper, lower, end))
+            d1, d2 = between(upper, lower), between(lower, end)
+            bend = sign * np.cross(d1, d2)
+            much = np.linalg.norm(bend, axis=-1)
+            plain = np.linalg.norm(local(upper, bend)) > 0.8 * much.mean()
+            if not plain or np.percentile(much, 90) < np.sin(np.radians(10)):
+                bend = _carried(-trunk, d1, across[base])
+                joint = "knee" if base == "pelvis" else "elbow"
+                notes.append(f"{joint}_{side} hardly bends, or to all sides: its axis is that of hips or shoulders")
+            axes[upper], axes[lower] = (
+                _frame(local(upper, bend), -local(upper, d1)),
+                _frame(local(lower, bend), -local(lower, d2)),
+            )
+        hand, forearm = f"hand_{side}", f"forearm_{side}"
+        along = unit(fingers[:, k] - pos[:, SEG[hand]]) if np.isfinite(fingers[:, k]).all() else between(forearm, hand)
+        left = quat_rotate(quat[:, SEG[forearm]], np.broadcast_to(axes[forearm][1], (len(quat), 3)))
+        axes[hand] = _frame(local(hand, left), -local(hand, along))
+
+        foot, ankle = f"foot_{side}", pos[:, FEET[k]]
+        speed = [
+            np.linalg.norm(np.concatenate([linear_velocity(v, c.rate) for v, c in each]), axis=-1)
+            for each in (zip([c.pos[:, FEET[k]] for c in human], human), zip([c.ball[:, k] for c in human], human))
+        ]
+        low = [p[:, 2] < np.percentile(p[:, 2], 10) + 0.03 for p in (ankle, ball[:, k])]
+        flat = low[0] & low[1] & (speed[0] < 0.25) & (speed[1] < 0.25)
+        if flat.sum() < 5:
+            flat = low[0]
+            notes.append(f"{foot} never stands: its sole is taken as level where the ankle is lowest")
+        up, ahead = local(foot, vertical, flat), local(foot, ball[:, k] - ankle, flat)
+        axes[foot] = _frame(np.cross(up, ahead), up)
+    return axes, [f"ASSUMED: {note}" for note in notes]
+
+
+def _carried(a, b, v):
+    """v turned as the shortest way turns a to b, unit vectors (T, 3) each."""
+    dot = lambda x, y: np.sum(x * y, axis=-1, keepdims=True)  # noqa: E731
+    return v - dot(a + b, v) / np.maximum(1.0 + dot(a, b), 1e-6) * (a + b) + 2.0 * dot(a, v) * b
+
+
+# ------------------------------------------------------------------------------------ CMU
+
+# CMU's skeletons: the same bones and zero pose for every subject, lengths and some directions of their own.  The head's
+# joint is where `head` starts: 9 cm below the headband, as in a skull.  The forearm is `radius` and `wrist` together:
+# `wrist` only pronates, and `hand` flexes.  `thorax` starts in the middle of the back.
+CMU_BONES = dict(
+    pelvis="root", chest="thorax", head="head",
+    thigh_l="lfemur", shin_l="ltibia", foot_l="lfoot", thigh_r="rfemur", shin_r="rtibia", foot_r="rfoot",
+    upper_arm_l="lhumerus", forearm_l="lradius", hand_l="lhand",
+    upper_arm_r="rhumerus", forearm_r="rradius", hand_r="rhand",
+)  # fmt: skip
+# Degrees, means over subjects 07, 08, 16, 35.  In straight walks the head looks down by 15 (10 to 18), and people look
+# ahead (ASSUMED).  With ankle and ball both slower than 0.25 m/s the sole, square to the shank in the zero pose, points
+# down by 2.9 (1.9 to 5.0).
+CMU_PITCH = dict(head=15.0, foot_l=2.9, foot_r=2.9)
+INCH = 0.0254  # m; CMU's unit is 1 / (:units length) inches
+AMC_RATE = 120.0  # Hz of CMU's AMC files, which do not say it
+
+
+def cmu_rig(skeleton: amc.Skeleton) -> Rig:
+    r"""The rig of a CMU skeleton, from its zero pose: a T-pose with splayed legs, all bones' frames being the file's.
+
+    Method    up: against the bone (thigh, shin, arm, hand), the file's y (trunk, head), the shin's (foot).
+              left: the knee's axis, with which the shin bends back, for the leg; against the elbow's axis, with which
+              the forearm bends forward, for upper arm and forearm; in the hand the T-pose's palms face down and the
+              thumbs forward, so left is up (left hand) or down.  Knee and elbow turn about x of their `axis`
+    Frame     of the file: x left, y up, z forward
+    Raises    UserError: bones are missing, or a knee or an elbow has no rx; names them
+    Test      tests/test_amc.py::test_zero_pose_is_a_t_pose, ::test_cmu_anatomy, ::test_unknown_skeleton
+    """
+    index = {n: i for i, n in enumerate(skeleton.names)}
+    wanted = {*CMU_BONES.values(), "ltoes", "rtoes"}
+    hinges = {"ltibia", "rtibia", "lradius", "rradius"}
+    missing = sorted(wanted - set(index)) or sorted(n for n in hinges if "rx" not in skeleton.dofs[index[n]])
+    if missing:
+        raise UserError(
+            f"{skeleton.path}: no CMU skeleton: {', '.join(missing)} missing or without rx; "
+            f"it has {', '.join(skeleton.names)}"
+        )
+
+    def hinge(name):
+        i = index[name]
+        return Rotation.from_euler(skeleton.axis_orders[i], skeleton.axes[i]).apply([1.0, 0.0, 0.0])
+
+    axes = dict.fromkeys(("pelvis", "chest", "head"), _frame("x", "y"))
+    for side, palm in (("l", "y"), ("r", "-y")):
+        up = {s: -skeleton.directions[index[side + s]] for s in ("femur", "tibia", "humerus", "radius", "hand")}
+        knee, elbow = hinge(f"{side}tibia"), -hinge(f"{side}radius")
+        axes[f"thigh_{side}"], axes[f"shin_{side}"] = _frame(knee, up["femur"]), _frame(knee, up["tibia"])
+        axes[f"foot_{side}"] = axes[f"shin_{side}"]
+        axes[f"upper_arm_{side}"], axes[f"forearm_{side}"] = _frame(elbow, up["humerus"]), _frame(elbow, up["radius"])
+        axes[f"hand_{side}"] = _frame(palm, up["hand"])
+    return Rig(CMU_BONES, axes, ("ltoes", "rtoes"), CMU_PITCH, INCH / skeleton.length)
+
+
+def from_amc(path, rate=AMC_RATE) -> Clip:
+    """Read a CMU motion as the canonical human; its skeleton lies beside it.
+
+    Symbols   as in `from_bvh`; unit 0.0254 / (:units length) m; the balls of the feet are where the toes start
+    Frame     world, floor at z = 0, metres; made level by `level`
+    Args      path : SUBJECT_TRIAL.amc beside SUBJECT.asf, or beside a single .asf of any name
+              rate : [Hz] of the file, which does not hold it; CMU's are 120
+    Returns   Clip at that rate, body cmu-SUBJECT with lengths of leg and arm
+    Raises    UserError: cannot be opened, malformed, no skeleton beside it, or not CMU's; names what was looked for
+    Test      tests/test_amc.py::test_from_amc_against_matrices, ::test_skeleton_beside, ::test_cmu_anatomy
+    """
+    s, motion = read_amc(path)
+    rig = cmu_rig(s)
+    calibrations = np.stack([rig.calibration(segment) for segment in SEGMENTS])
+    pose = amc.global_pose(s, motion)
+    clip = level(_human(rig, calibrations, s.names, *pose, Path(path).stem, "", float(rate)))
+    return replace(clip, body=_body(f"cmu-{Path(s.path).stem}", clip))
+
+
+LEVEL_SPREAD, LEVEL_LIMIT = 0.2, 3.0  # m; degrees
+
+
+def level(clip: Clip) -> Clip:
+    r"""The clip turned about the origin so that the floor under its standing feet is level.
+
+    Why       the floor of CMU's subjects 07 and 08 rises by 1.8 to 2.1 cm a metre: 6 cm from end to end of a walk
+    Equation  g = argmin mean_i (h_i − g·x_i)² + s² |g|²; h_i, x_i: height and place of a standing ball, both less that
+              foot's means.  s = 0.2 m: where the feet spread less than that, as across a straight walk, g stays 0.
+              Then a turn by atan |g| about (−g_y, g_x, 0)
+    ASSUMED   the floor is a plane through the capture's origin: there the balls of all four subjects stand 3 to 5 cm
+              high.  More than 3 degrees are stairs or a ramp, which stay
+    Test      tests/test_amc.py::test_level, ::test_cmu_floor
+    """
+    standing = (clip.ball[..., 2] < CONTACT_HEIGHT) & (
+        np.linalg.norm(linear_velocity(clip.ball, clip.rate), axis=-1) < CONTACT_SPEED
+    )
+    feet = [clip.ball[standing[:, k], k] for k in (0, 1) if standing[:, k].any()]
+    if not feet:
+        return clip
+    d = np.concatenate([f - f.mean(axis=0) for f in feet])
+    x, h = d[:, :2], d[:, 2]
+    g = np.linalg.solve(x.T @ x / len(x) + LEVEL_SPREAD**2 * np.eye(2), x.T @ h / len(x))
+    steep = np.linalg.norm(g)
+    angle = np.arctan(steep)
+    if not 0.0 < angle < np.radians(LEVEL_LIMIT):
+        return clip
+    q = np.array([np.cos(angle / 2), *np.sin(angle / 2) / steep * np.array([-g[1], g[0], 0.0])])
+    return replace(clip, pos=quat_rotate(q, clip.pos), ball=quat_rotate(q, clip.ball), quat=quat_mul(q, clip.quat))
+
+
+def read_amc(path):
+    """Skeleton and motion of an .amc file."""
+    path = Path(path)
+    beside = sorted(f for f in path.parent.glob("*") if f.suffix.lower() == ".asf")
+    subject = path.stem.rpartition("_")[0] or path.stem
+    skeleton = [f for f in beside if f.stem == subject] or beside
+    try:
+        if path.exists() and len(skeleton) != 1:
+            found = ", ".join(f.name for f in beside[:6]) or "none"
+            raise UserError(
+                f"{path}: no skeleton beside it: looked for {subject}.asf or a single .asf in {path.parent}; "
+                f"there is {found}"
+            )
+        s = amc.read_asf(skeleton[0]) if skeleton else None
+        return s, amc.read_amc(path, s)
+    except amc.AmcError as e:
+        raise UserError(str(e)) from None
+    except OSError as e:
+        raise UserError(f"{path}: {e.strerror or e}; expected an .amc file") from None

@@ -1,0 +1,771 @@
+r"""Recorded or live headset and controllers drive the character  [Reda23 §3.3 Eq. 4, §4.1].
+
+    CSV lines ──► Reader ──► to_world ──► Guard ──► Calibration ──► Resampler ──► Player
+    file, stdin   columns    axes         losses    user's size     30 Hz         observe, policy, physics
+
+Columns, named in the first line, in any order; others are ignored:
+
+    time                                             [s]; may be absent: then the rows are 1 / `sample_rate` apart
+    head_px head_py head_pz                          position [m]
+    head_qx head_qy head_qz head_qw                  orientation, a unit quaternion
+    left_px … left_qw, right_px … right_qw           the controllers
+
+Also known: `t`, `timestamp`; `hmd_`, `headset_`; `left_hand_`, `left_controller_`; `_pos_x`, `_rot_x`.  An empty cell,
+`nan` or `null` says that the device is not tracked.  Quaternions are x, y, z, w here, w, x, y, z behind `to_world`.
+
+Nothing here looks ahead, and memory does not grow with the length of a stream.
+"""
+
+from __future__ import annotations
+
+import queue
+import re
+import sys
+import threading
+import time
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from env import BAD, SUBSTEPS, fallen, observation_terms, observe
+from mocap import CONTROL_RATE, heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate, quat_slerp
+from retarget import STAGE_VEL, Character, geom_lowest
+from runs import UserError
+
+DEVICES = ("head", "left", "right")
+PARTS = ("px", "py", "pz", "qx", "qy", "qz", "qw")
+COLUMNS = ("time", *(f"{d}_{p}" for d in DEVICES for p in PARTS))
+SAMPLE_RATE = 90.0  # Hz, of a stream without times
+LINE_LIMIT = 65536  # bytes
+UNREADABLE_LIMIT = 100  # unreadable lines in a row that end a live stream
+EMPTY = ("", "nan", "null", "none")
+
+# ------------------------------------------------------------------------------------ reading
+
+
+class Sample(NamedTuple):
+    """One reading of the three devices: t [s], pos (3, 3) [m], quat (3, 4); NaN where there is none."""
+
+    t: float
+    pos: np.ndarray
+    quat: np.ndarray
+
+
+def column(name: str) -> str | None:
+    """The canonical name of a column, or None for one that is not ours.  Test: tests/test_stream.py::test_columns"""
+    name = name.strip().strip('"').lower()
+    if name in ("time", "t", "timestamp"):
+        return "time"
+    device = r"(head|hmd|headset|(?:left|right)(?:_hand|_controller)?)"
+    found = re.fullmatch(device + r"_(?:(?:p|pos_|position_|)([xyz])|(?:q|rot_|rotation_)([xyzw]))", name)
+    if not found:
+        return None
+    device = "head" if found[1] in ("head", "hmd", "headset") else found[1].split("_")[0]
+    return f"{device}_p{found[2]}" if found[2] else f"{device}_q{found[3]}"
+
+
+class Reader:
+    """Lines -> Samples, in the file's own axes, quaternions x, y, z, w.
+
+    name   : of the source, for complaints
+    strict : a line that cannot be read is an error (files); otherwise it is skipped and counted (live streams), and
+             100 of them in a row are an error.  A file's last line may be cut short: it is skipped
+    Test     tests/test_stream.py::test_columns, test_garbage_lines, test_garbage_on_stdin
+    """
+
+    def __init__(self, name: str, strict=True):
+        self.name, self.strict = name, strict
+        self.line = self.unreadable = self.in_a_row = 0
+        self.at = self.names = None
+
+    def read(self, lines):
+        """Samples of an iterable of lines (bytes or text), one by one."""
+        for line in lines:
+            self.line += 1
+            text = line.decode("utf-8", "replace") if isinstance(line, bytes) else line
+            if len(text) >= LINE_LIMIT:
+                raise UserError(f"{self.name}, line {self.line}: longer than {LINE_LIMIT} bytes; valid: a CSV's lines")
+            cells = text.lstrip("\ufeff").strip()
+            if not cells or cells.startswith("#"):
+                continue
+            if self.at is None:
+                self.header(cells)
+                continue
+            try:
+                values = self.values(cells)
+            except ValueError as error:
+                self.unreadable += 1
+                self.in_a_row += 1
+                if self.strict and text.endswith("\n") or self.in_a_row >= UNREADABLE_LIMIT:
+                    raise UserError(f"{self.name}, line {self.line}, {error}") from None
+                continue
+            self.in_a_row = 0
+            devices = values[1:].reshape(3, 7)
+            yield Sample(float(values[0]), devices[:, :3], devices[:, 3:])
+        if self.at is None:
+            raise UserError(f"{self.name}: is empty; expected a line of column names: {valid_columns()}")
+
+    def header(self, line):
+        """The first line: where which column is."""
+        self.names = [c.strip() for c in line.split(",")]
+        known = [column(c) for c in self.names]
+        missing = [c for c in COLUMNS[1:] if c not in known]
+        twice = [c for c, k in Counter(known).items() if c and k > 1]
+        if twice:
+            raise UserError(f"{self.name}, line {self.line}: column {twice[0]} is there twice; valid: once each")
+        if missing:
+            more = f" and {len(missing) - 4} more" if len(missing) > 4 else ""
+            raise UserError(
+                f"{self.name}, line {self.line}: no column {', '.join(missing[:4])}{more}; "
+                f"it has {', '.join(self.names)[:200]}; valid: {valid_columns()}"
+            )
+        self.at = [known.index(c) if c in known else -1 for c in COLUMNS]
+
+    def values(self, line):
+        """The numbers of a row in the order of COLUMNS.  ValueError: which column, and why."""
+        cells = line.split(",")
+        if len(cells) != len(self.names):
+            column = self.names[min(len(cells), len(self.names)) - 1]
+            raise ValueError(f"column {column}: {len(cells)} cells; valid: {len(self.names)}, as in the first line")
+        out = np.full(len(COLUMNS), np.nan)
+        for k, i in enumerate(self.at):
+            cell = cells[i].strip().strip('"') if i >= 0 else ""
+            if cell.lower() not in EMPTY:
+                try:
+                    out[k] = float(cell)
+                except ValueError:
+                    raise ValueError(f"column {self.names[i]}: {cell[:40]!r}; valid: a number, or nothing") from None
+        return out
+
+
+def valid_columns() -> str:
+    """The columns as a complaint lists them.  Test: tests/test_stream.py::test_columns"""
+    return "time (optional) and DEVICE_px, _py, _pz, _qx, _qy, _qz, _qw for DEVICE head, left, right"
+
+
+def lines_of(path):
+    """The lines of a file, or of standard input for "-", as they come, none longer than LINE_LIMIT.
+
+    Raises    UserError: no such file
+    Test      tests/test_stream.py::test_columns, test_stdin"""
+    if str(path) == "-":
+        yield from iter(lambda: sys.stdin.buffer.readline(LINE_LIMIT), b"")
+        return
+    if not Path(path).is_file():
+        raise UserError(f"--stream {path}: no such file; valid: a .csv file, or - for standard input")
+    with open(path, "rb") as file:
+        yield from iter(lambda: file.readline(LINE_LIMIT), b"")
+
+
+def arriving(items, silence: float, period: float):
+    """The items of an iterator as they come, and how many seconds nothing came: first `silence`, then every `period`.
+
+    A thread reads ahead, 1000 items at most.
+    Test      tests/test_stream.py::test_stdin_that_pauses"""
+    box, end = queue.Queue(1000), object()
+
+    def read():
+        try:
+            for item in items:
+                box.put(item)
+            box.put(end)
+        except BaseException as error:  # noqa: BLE001, raised again where it can be seen
+            box.put(error)
+
+    threading.Thread(target=read, daemon=True).start()
+    wait = silence
+    while True:
+        try:
+            item = box.get(timeout=wait)
+        except queue.Empty:
+            yield float(wait)
+            wait = period
+            continue
+        wait = silence
+        if item is end:
+            return
+        if isinstance(item, BaseException):
+            raise item
+        yield item
+
+
+# ------------------------------------------------------------------------------------ axes
+
+AXES = {  # name -> matrix whose rows are our x (forward), y (left), z (up) in the source's coordinates
+    "unity": np.array([[0.0, 0, 1], [-1, 0, 0], [0, 1, 0]]),  # x right, y up, z forward: left-handed
+    "openxr": np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]),  # x right, y up, z backward: right-handed
+    "mujoco": np.eye(3),  # ours
+}
+# How far the fingers point below the controller's forward axis [degrees].  ASSUMED.  90: OpenXR's grip pose, whose
+# forward axis runs along the fist from the little finger to the thumb.  15: what points, as a ray or a sabre does.
+GRIP = {"unity": 15.0, "openxr": 90.0, "mujoco": 90.0}
+
+
+def to_world(pos, quat, axes: str, grip: float | None = None):
+    r"""A source's axes -> ours: x forward, y left, z up, right-handed.
+
+    Equation  p' = M p;  R' = M R Mᵀ, so that (x, y, z, w) -> (w, det(M) M (x, y, z)): an axis of rotation is an
+              axial vector, and a left-handed source's turns are the other way round
+              hands: R' R_y(−(90° − grip)), because the canonical hand's fingers point along −z
+    Args      pos (..., 3, 3) [m], quat (..., 3, 4) x, y, z, w, of head, left, right
+              axes : unity, openxr or mujoco; grip [degrees], of the axes by default
+    Returns   pos (..., 3, 3), quat (..., 3, 4) w, x, y, z
+    Raises    UserError: unknown axes
+    Test      tests/test_stream.py::test_axes_by_hand, test_axes_against_matrices, test_grip
+    """
+    if axes not in AXES:
+        raise UserError(f"--axes {axes}: unknown; valid: {', '.join(AXES)}")
+    m, quat = AXES[axes], np.asarray(quat, float)
+    turn = np.radians(-90.0 + (GRIP[axes] if grip is None else grip))
+    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is the Guard's
+        q = np.concatenate([quat[..., 3:], np.round(np.linalg.det(m)) * (quat[..., :3] @ m.T)], axis=-1)
+        if turn:
+            q[..., 1:, :] = quat_mul(q[..., 1:, :], quat_about(1, turn))
+        return np.asarray(pos, float) @ m.T, q
+
+
+# ------------------------------------------------------------------------------------ what can go wrong
+
+GAP = 0.1  # s without a row: a drop-out
+FROZEN = 0.25  # s without any change while another device moves: lost
+FAR_AWAY = 100.0  # m from the source's origin: not a place
+REACH = 1.5  # m from headset to controller: longer than an arm
+TELEPORT = 1.0  # m between two headset poses: the stream is re-anchored
+STEP = 0.2  # m between two samples of a headset: too fast for a head
+JUMP = 0.5  # m between two samples of a controller: too fast for a hand
+SETTLE = 0.1  # s that a controller which jumped must stay where it is
+HOLD, RELAX = 1.0, 0.5  # s that a lost controller is held; time constant with which it then sinks
+BLEND, CATCH_UP = 0.3, 2.0  # s, m/s: the way back from the held to the true pose
+CLOCK_AHEAD, CLOCK_BACK = 5.0, 1.0  # s: farther jumps of the time column are another clock
+# The hanging hand in the headset's heading frame [m], of a user of 1.75 m (the built-in human).  ASSUMED
+NEUTRAL = np.array([[0.0, 0.0, 0.0], [-0.04, 0.26, -0.90], [-0.04, -0.26, -0.90]])
+
+
+class Clock:
+    """The time column -> seconds since the first row, never backwards.
+
+    Rule    no time, or NaN, or ten rows of one time: 1 / rate after the row before; a row up to 1 s before its
+            predecessor is dropped; a jump back by more, or by more than 5 s ahead, is another clock: 1 / rate is taken
+    Test    tests/test_stream.py::test_unordered_times, test_another_clock
+    """
+
+    def __init__(self, rate=SAMPLE_RATE):
+        self.rate, self.last, self.base = rate, None, 0.0
+        self.dropped = self.jumps = self.same = 0
+        self.forget = False  # the next row tells a new time
+
+    def stamp(self, t: float) -> float | None:
+        """Seconds since the first row, or None for a row to drop."""
+        if self.last is None:
+            self.base = -t if np.isfinite(t) else 0.0
+            self.last = 0.0
+            return 0.0
+        step = t + self.base - self.last if np.isfinite(t) else 1.0 / self.rate
+        step = 0.0 if abs(step) < 1e-9 else step
+        self.same = self.same + 1 if step == 0 else 0
+        if self.forget or self.same >= 10 or not -CLOCK_BACK <= step <= CLOCK_AHEAD:
+            self.jumps += not self.forget
+            step = 1.0 / self.rate
+            self.base = self.last + step - t if np.isfinite(t) else self.base
+        self.forget = False
+        if step < 0:
+            self.dropped += 1
+            return None
+        self.last += step
+        return self.last
+
+    def idle(self, seconds: float) -> float:
+        """Time goes on without rows."""
+        self.last, self.forget = (self.last or 0.0) + seconds, True
+        return self.last
+
+
+@dataclass
+class Track:
+    """What the Guard knows of one device."""
+
+    raw: np.ndarray | None = None  # (7,) of the last usable row, as it came
+    changed: float = -np.inf  # s, when raw last changed
+    good: np.ndarray | None = None  # (3,) last position taken as true, anchored world
+    yaw: float = 0.0  # its heading
+    lost: str | None = "not seen"  # why, or None
+    since: float = 0.0  # s, lost since
+    jumped: np.ndarray | None = None  # (3,) where a controller jumped to
+    settling: float = 0.0  # s, since when it is there
+    last: tuple | None = None  # pose given out: of the headset in the world, of a controller in its heading frame
+    held: tuple | None = None  # pose to blend from, likewise
+    mix: float = 1.0  # 0 held .. 1 true
+    pace: float = 0.0  # of mix, per second
+
+
+def fault(row) -> str | None:
+    """Why a device's row (7,) cannot be a pose, or None.  Test: tests/test_stream.py::test_faults"""
+    if not np.isfinite(row).all():
+        return "not finite"
+    if not row.any():
+        return "all zero"
+    if np.abs(row[:3]).max() > FAR_AWAY:
+        return "far away"
+    return "no rotation" if abs(np.linalg.norm(np.clip(row[3:], -1e3, 1e3)) - 1.0) > 0.1 else None
+
+
+class Guard:
+    r"""Three devices that may be lost at any time -> three finite poses.
+
+    Rule      a device is lost in a row that is all zero, not finite, no rotation (| |q| − 1 | > 0.1) or more than
+              100 m away; when it has not changed for 0.25 s while another one moved; a controller also when it is
+              1.5 m from the headset, or moved by more than 0.5 m between two rows, until it has stayed there for
+              0.1 s.  More than 0.1 s without a row: all are lost
+    Hold      a lost headset stays where it was.  A lost controller keeps its place relative to the headset; after 1 s
+              it sinks to hang beside the body (time constant 0.5 s)
+    Return    from the held to the true pose in 0.3 s, or at 2 m/s if that is longer; likewise a headset after a step
+              of more than 0.2 m between two rows
+    Anchor    a headset that comes back, or moves between two rows, by more than 1 m has been teleported: the whole
+              stream is then shifted and turned about the vertical, so that the headset goes on from where it was (its
+              height only if that changed by more than 0.5 m)
+    Frame     `to_world`'s, quaternion w, x, y, z; times from `Clock`
+    Test      tests/test_stream.py::test_zero_rows, test_nan_rows, test_frozen_sensor, test_drop_out, test_teleport,
+              test_controller_glitch, test_never_nan
+    """
+
+    def __init__(self, rate=CONTROL_RATE):
+        self.rate, self.t = rate, None
+        self.tracks = [Track() for _ in DEVICES]
+        self.yaw, self.shift = 0.0, np.zeros(3)  # the anchor: p' = R_z(yaw) p + shift
+        self.events, self.seconds = Counter(), Counter()  # (device, what) -> how often, how long
+
+    def push(self, sample: Sample, why=None) -> list[Sample]:
+        """The poses to use, in order: several after a drop-out, none before the headset is seen.
+
+        Args      why : the whole row is no reading, for this reason"""
+        out = []
+        if self.t is not None and sample.t - self.t > GAP:
+            nothing = np.full((3, 7), np.nan)
+            while self.t + 1.0 / self.rate < sample.t:
+                out.append(self._one(self.t + 1.0 / self.rate, nothing, "drop-out"))
+        out.append(self._one(sample.t, np.concatenate([sample.pos, sample.quat], axis=1), why))
+        return [s for s in out if s is not None]
+
+    def live(self, device=0) -> bool:
+        """Is the last pose given out the device's own, not a held or blended one?"""
+        return self.tracks[device].lost is None and self.tracks[device].mix >= 1.0
+
+    def report(self) -> list[str]:
+        """What happened, one line a kind.  Test: tests/test_stream.py::test_zero_rows"""
+        lines = []
+        for key, n in sorted(self.events.items()):
+            lasted = f", {self.seconds[key]:.2f} s" if self.seconds[key] else ""
+            lines.append(f"{' '.join(key)}: {n} time{'s' * (n > 1)}{lasted}")
+        return lines
+
+    def _one(self, t, rows, why=None):
+        """One row of every device -> Sample or None."""
+        dt = 0.0 if self.t is None else t - self.t
+        self.t = t
+        faults = [why or fault(row) for row in rows]
+        for track, row, bad in zip(self.tracks, rows, faults):
+            if not bad and (track.raw is None or not np.array_equal(track.raw, row)):
+                track.raw, track.changed = row, t
+        newest = max(track.changed for track in self.tracks)
+        for i, track in enumerate(self.tracks):
+            if not faults[i] and t - track.changed > FROZEN and newest > track.changed:
+                faults[i] = "frozen"
+        lost = np.array([bool(f) for f in faults])
+        rows = np.where(lost[:, None], [0.0, 0, 0, 1, 0, 0, 0], rows)
+        quat = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+        if not faults[0]:
+            self._anchor(rows[0, :3], quat[0])
+        turn = quat_about(2, self.yaw)
+        pos, quat = quat_rotate(np.tile(turn, (3, 1)), rows[:, :3]) + self.shift, quat_mul(turn, quat)
+        head = self._device(0, t, dt, faults[0], (pos[0], quat[0]), (np.zeros(3), np.array([1.0, 0, 0, 0])))
+        if head is None:
+            return None
+        frame = head[0], quat_about(2, heading(head[1]))
+        out = [head]
+        for i in (1, 2):
+            bad = faults[i] or self._astray(i, t, pos[i], head[0])
+            out.append(self._device(i, t, dt, bad, (pos[i], quat[i]), frame))
+        return Sample(t, np.stack([p for p, _ in out]), np.stack([q for _, q in out]))
+
+    def _anchor(self, pos, quat):
+        """Re-anchor the stream if its headset, given as it came, is suddenly elsewhere."""
+        head = self.tracks[0]
+        place = lambda: quat_rotate(quat_about(2, self.yaw), pos) + self.shift  # noqa: E731
+        if head.good is not None and np.linalg.norm(place() - head.good) > TELEPORT:
+            self.events["head", "teleport"] += 1
+            self.yaw = float(head.yaw - heading(quat))
+            gap = head.good - place()
+            self.shift = self.shift + gap * [1.0, 1.0, abs(gap[2]) > 0.5]
+        head.yaw = float(heading(quat)) + self.yaw
+
+    def _astray(self, i, t, pos, head):
+        """Why a controller's usable row is not to be believed, or None."""
+        track = self.tracks[i]
+        if np.linalg.norm(pos - head) > REACH:
+            return "out of reach"
+        if track.lost in (None, "jump") and track.good is not None and np.linalg.norm(pos - track.good) > JUMP:
+            if track.jumped is None or np.linalg.norm(pos - track.jumped) > JUMP:
+                track.settling = t
+            track.jumped = pos
+            if t - track.settling < SETTLE:
+                return "jump"
+        track.jumped = None
+        return None
+
+    def _device(self, i, t, dt, bad, true, frame):
+        """Hold, blend or believe one device.  true, frame : (pos, quat), world -> (pos, quat), or None: never seen."""
+        track = self.tracks[i]
+        if bad:
+            if track.last is None and i == 0:
+                return None
+            if track.last is None:
+                track.last = (NEUTRAL[i], np.array([1.0, 0, 0, 0]))
+            if track.lost is None or track.held is None:
+                track.held, track.since = track.last, t
+            if track.lost != bad:
+                self.events[DEVICES[i], bad] += 1
+            self.seconds[DEVICES[i], bad] += dt
+            track.lost, track.mix = bad, 0.0
+            if i and t - track.since > HOLD:
+                share = 1.0 - np.exp(-dt / RELAX)
+                track.held = blend(track.held, (NEUTRAL[i], np.array([1.0, 0, 0, 0])), share)
+            track.last = track.held
+        else:
+            own = to_frame(frame, true)
+            step = i == 0 and track.lost is None and np.linalg.norm(true[0] - track.good) > STEP
+            if track.last is not None and (track.lost or step):
+                if step:
+                    self.events["head", "step"] += 1
+                track.held, track.mix = track.last, 0.0
+                track.pace = 1.0 / max(BLEND, np.linalg.norm(own[0] - track.held[0]) / CATCH_UP)
+            track.lost, track.good = None, true[0]
+            track.mix = min(1.0, track.mix + dt * track.pace)
+            track.last = own if track.mix >= 1.0 else blend(track.held, own, track.mix)
+        return from_frame(frame, track.last)
+
+
+def blend(a, b, share):
+    """Between the poses a and b (pos, quat).  Test: tests/test_stream.py::test_poses"""
+    return a[0] + share * (b[0] - a[0]), quat_slerp(a[1], b[1], share)
+
+
+def to_frame(frame, pose):
+    """A world pose (pos, quat) in a frame, itself a pose.  Test: tests/test_stream.py::test_poses"""
+    back = quat_conj(frame[1])
+    return quat_rotate(back, pose[0] - frame[0]), quat_mul(back, pose[1])
+
+
+def from_frame(frame, pose):
+    """A pose in a frame -> the world.  Test: tests/test_stream.py::test_poses"""
+    return frame[0] + quat_rotate(frame[1], pose[0]), quat_mul(frame[1], pose[1])
+
+
+# ------------------------------------------------------------------------------------ time and size
+
+
+class Resampler:
+    """Samples of any rate -> poses at the control rate.
+
+    Rule      tick k is at k / rate after the first sample; it lies between the last sample before it and the first one
+              at or after it (lerp, slerp) and is given out when that one comes: no later change, no look-ahead
+    Test      tests/test_stream.py::test_resampler_against_scipy, test_resampler_is_causal
+    """
+
+    def __init__(self, rate=CONTROL_RATE):
+        self.rate, self.k, self.t0, self.last = rate, 0, None, None
+
+    def push(self, sample: Sample) -> list[Sample]:
+        """The ticks that this sample completes."""
+        if self.t0 is None:
+            self.t0, self.last = sample.t, sample
+        out = []
+        while (tick := self.t0 + self.k / self.rate) <= sample.t + 1e-9:
+            span = sample.t - self.last.t
+            u = np.clip((tick - self.last.t) / span, 0.0, 1.0) if span > 0 else 1.0
+            pos, quat = blend((self.last.pos, self.last.quat), (sample.pos, sample.quat), u)
+            out.append(Sample(self.k / self.rate, pos, quat))
+            self.k += 1
+        self.last = sample
+        return out
+
+
+CALIBRATION = 1.0  # s of headset
+STANDING = (1.0, 1.9)  # m, where the headset of a standing user may be; otherwise the floor is not at height 0
+AVERAGE = 1.64  # m, headset of a user of 1.75 m, taken where the floor is not known.  ASSUMED
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The user's world -> the character's: p' = s ⊙ R_z(−yaw) (p − origin), as `retarget.root_scale` maps positions.
+
+    Test      tests/test_stream.py::test_calibration
+    """
+
+    height: float  # m, standing user's headset above the floor
+    floor: float  # m, height of the floor in the stream
+    estimated: bool  # the floor is a guess
+    yaw: float  # rad, where the user looked
+    origin: np.ndarray  # (3,) on the floor below the headset
+    scale: np.ndarray  # (3,)
+
+    def apply(self, sample: Sample) -> Sample:
+        """A sample in the character's world."""
+        pos, quat = to_frame((self.origin, quat_about(2, self.yaw)), (sample.pos, sample.quat))
+        return Sample(sample.t, pos * self.scale, quat)
+
+
+def calibrate(char: Character, pos, quat, user_height: float | None = None) -> Calibration:
+    r"""User's size, floor and forward direction from a second of headset poses.
+
+    Height    the 87.5th percentile of the headset's height (the median of its upper quarter: people stoop, nobody
+              stretches) is a standing user's; s_z = the character's headset height / the user's, s_xy as in the TOML
+    Floor     at height 0 of the stream if that makes the user's headset 1.0 to 1.9 m high; otherwise 1.64 m below it;
+              with user_height, that much below it
+    Forward   the mean heading; the place: the median
+    ASSUMED   all three; the paper does not say how a real user is measured
+    Args      pos (T, 3), quat (T, 4) of the headset, `to_world`'s axes
+    Test      tests/test_stream.py::test_calibration
+    """
+    top = float(np.percentile(pos[:, 2], 87.5))
+    estimated = user_height is not None or not STANDING[0] <= top <= STANDING[1]
+    height = (user_height or AVERAGE) if estimated else top
+    yaw = heading(quat)
+    yaw = float(np.arctan2(np.sin(yaw).mean(), np.cos(yaw).mean()))
+    origin = np.array([*np.median(pos[:, :2], axis=0), top - height])
+    xy = char.spec["root"].get("scale_xy", 1.0)
+    return Calibration(height, top - height, estimated, yaw, origin, np.array([xy, xy, headset(char)[2] / height]))
+
+
+def headset(char: Character) -> np.ndarray:
+    """Where the character's headset is when it stands at the origin in its default pose.  (3,) [m]
+
+    Test      tests/test_stream.py::test_stand"""
+    data = mujoco.MjData(char.model)
+    data.qpos[2], data.qpos[7:] = char.hip_height, char.default
+    mujoco.mj_kinematics(char.model, data)
+    return data.site_xpos[char.sensor_sites[0]].copy()
+
+
+class Stream:
+    """Samples as they come -> poses at the control rate in the character's world.
+
+    axes, grip  : as `to_world`; sample_rate : of a stream without times [Hz]; user_height : as `calibrate`
+    Test          tests/test_stream.py::test_round_trip, test_never_nan
+    """
+
+    def __init__(self, char, axes="unity", rate=CONTROL_RATE, sample_rate=SAMPLE_RATE, grip=None, user_height=None):
+        if axes not in AXES:
+            raise UserError(f"--axes {axes}: unknown; valid: {', '.join(AXES)}")
+        self.char, self.axes, self.grip, self.user_height = char, axes, grip, user_height
+        self.clock, self.guard, self.resampler = Clock(sample_rate), Guard(rate), Resampler(rate)
+        self.calibration, self.seen, self.rows = None, [], 0
+
+    def push(self, sample: Sample) -> list[Sample]:
+        """The ticks that a reading completes; none in the first second, which calibrates."""
+        self.rows += 1
+        t = self.clock.stamp(sample.t)
+        return [] if t is None else self._go(Sample(t, *to_world(sample.pos, sample.quat, self.axes, self.grip)))
+
+    def idle(self, seconds: float) -> list[Sample]:
+        """Nothing came for so long: the ticks of a drop-out."""
+        if self.guard.t is None:
+            return []
+        nothing = np.full((3, 7), np.nan)
+        return self._go(Sample(self.clock.idle(seconds), nothing[:, :3], nothing[:, 3:]), "drop-out")
+
+    def _go(self, sample, why=None):
+        ticks = []
+        for s in self.guard.push(sample, why):
+            if self.calibration:
+                ticks += [self.calibration.apply(tick) for tick in self.resampler.push(s)]
+            elif self.guard.live():
+                self.seen.append((s.t, s.pos[0], s.quat[0]))
+                if self.tracked() >= CALIBRATION:
+                    _, pos, quat = zip(*self.seen, strict=True)
+                    self.calibration = calibrate(self.char, np.array(pos), np.array(quat), self.user_height)
+                    self.seen = []
+        return ticks
+
+    def tracked(self) -> float:
+        """Seconds of headset seen while calibrating."""
+        return self.seen[-1][0] - self.seen[0][0] if self.seen else 0.0
+
+    def report(self) -> list[str]:
+        """What was calibrated and what went wrong, for a reader.  Test: tests/test_stream.py::test_real_recordings"""
+        lines = []
+        if c := self.calibration:
+            how = "guessed" if c.estimated and not self.user_height else "as told" if c.estimated else "the stream's"
+            lines.append(
+                f"user's headset {c.height:.2f} m above the floor; floor at {c.floor:.2f} m ({how}); "
+                f"forward {np.degrees(c.yaw):.0f} degrees; heights times {c.scale[2]:.3f}"
+            )
+        lines += self.guard.report()
+        for n, what in (
+            (self.clock.dropped, "rows before their predecessor"),
+            (self.clock.jumps, "jumps of the clock"),
+        ):
+            lines += [f"{n} {what}"] if n else []
+        return lines
+
+
+# ------------------------------------------------------------------------------------ the character
+
+AWAY = 1.0  # m, horizontally from the headset to the root: the character has lost the user
+
+
+class Player:
+    """One character driven by sensor poses; there is no human to compare with.
+
+    Rule      it starts standing in the default pose under the headset, feet on the floor, moving as the headset does
+              horizontally.  When its upper body touches the floor, its headset's place above the root is more than 1 m
+              (horizontally) from the user's, or its state is not finite, that is counted and it stands under the
+              headset again: the state given out is always finite
+    Errors    distances of the character's headset and controller sites from the poses it is given, over all ticks
+    Args      act : observation (1, n) -> action (1, u); force : (seconds, root yaw) -> (3,) [N] on the root, world
+    Test      tests/test_stream.py::test_player_observes_as_env, test_stand, test_falls_are_counted, test_never_nan
+    """
+
+    ENDS = ("fall", "away", "bad")
+
+    def __init__(self, char: Character, act, rate=CONTROL_RATE, substeps=SUBSTEPS, force=None):
+        self.char, self.act, self.dt, self.substeps, self.force = char, act, 1.0 / rate, substeps, force
+        char.model.opt.timestep = self.dt / substeps
+        self.batch = char.batch(1, 1)
+        names = "qpos qvel ctrl qacc_warmstart xfrc_applied xpos xmat cvel geom_xpos geom_xmat site_xpos"
+        for name in names.split():
+            setattr(self, name, self.batch.bind(name))
+        self.slices, start = {}, 0
+        for name, size in observation_terms(char)["actor"].items():
+            self.slices[name] = slice(start, start + size)
+            start += size
+        self.obs_size, self.action_size = start, len(char.limits)
+        self.obs = np.zeros((1, start), np.float32)
+        self.headset = headset(char)
+        self.before, self.ticks, self.ends = None, 0, Counter()
+        self.head_error = self.hand_error = 0.0  # sums [m]
+        self.latency = deque(maxlen=100_000)  # (to the torque, to the new state) [s]
+
+    def stand(self, pos, quat):
+        """The default pose under a headset.  pos (3, 3), quat (3, 4), world  Test: tests/test_stream.py::test_stand"""
+        turn = quat_about(2, heading(quat[0]))
+        place = pos[0] - quat_rotate(turn, self.headset)
+        self.qpos[0] = [*place[:2], self.char.hip_height, *turn, *self.char.default]
+        for array in (self.qvel, self.ctrl, self.qacc_warmstart, self.xfrc_applied):
+            array[0] = 0.0
+        self.qvel[0, :2] = (pos[0] - self.before[0][0, 0])[:2] / self.dt if self.before else 0.0
+        self.batch.forward(np.arange(1), STAGE_VEL)
+
+    def step(self, pos, quat) -> str | None:
+        """One control step.
+
+        Args      pos (3, 3), quat (3, 4) of this tick
+        Returns   why it had to stand anew, one of ENDS, or None"""
+        start = time.perf_counter()
+        now = (pos[None], quat_matrix(quat)[None, ..., :2].astype(np.float32))
+        if self.before is None:
+            self.stand(pos, quat)
+            self.before = now
+        error = np.linalg.norm(self.site_xpos[0, self.char.sensor_sites] - pos, axis=-1)
+        self.head_error += error[0]
+        self.hand_error += error[1:].mean()
+        observe(self, slice(None), self.before, now, self.obs)
+        action = self.act(self.obs)
+        self.ctrl[:] = np.clip(action, -1.0, 1.0)
+        decided = time.perf_counter()
+        if self.force:
+            self.xfrc_applied[0, self.char.root, :3] = self.force(self.ticks * self.dt, heading(self.qpos[0, 3:7]))
+        self.batch.step(nstep=self.substeps, stage=STAGE_VEL)
+        self.ticks += 1
+        end = self._end(pos)
+        if end:
+            self.ends[end] += 1
+            self.batch.warning[:] = 0
+            self.stand(pos, quat)
+        self.before = now
+        self.latency.append((decided - start, time.perf_counter() - start))
+        return end
+
+    def _end(self, pos):
+        """Which of ENDS the present state is, or None."""
+        finite = np.isfinite(self.qpos).all() and np.isfinite(self.qvel).all() and np.isfinite(self.ctrl).all()
+        if not finite or (self.batch.warning[:, BAD, 1] > 0).any():
+            return "bad"
+        if fallen(geom_lowest(self.char.model, self.char.fall_geoms, self.geom_xpos, self.geom_xmat).min(1))[0]:
+            return "fall"
+        turn = quat_about(2, heading(self.qpos[0, 3:7]))
+        under = self.qpos[0, :2] + quat_rotate(turn, self.headset)[:2]
+        return "away" if np.linalg.norm(under - pos[0, :2]) > AWAY else None
+
+    def report(self) -> list[str]:
+        """Falls, errors, latency.  Test: tests/test_stream.py::test_falls_are_counted"""
+        if not self.ticks:
+            return ["0 s played"]
+        seconds, n = self.ticks * self.dt, sum(self.ends.values())
+        ends = f"{self.ends['fall']} falls, {self.ends['away']} times lost the user, {self.ends['bad']} diverged"
+        every = f"one every {seconds / n:.1f} s" if n else "none"
+        torque, state = (1000 * np.percentile(k, [50, 99]) for k in np.array(self.latency).T)
+        return [
+            f"{seconds:.1f} s played: {ends} ({every})",
+            f"head error {100 * self.head_error / self.ticks:.1f} cm, "
+            f"hand error {100 * self.hand_error / self.ticks:.1f} cm, mean over all ticks",
+            f"latency: sensors to torque p50 {torque[0]:.2f} ms, p99 {torque[1]:.2f} ms; "
+            f"with the physics p50 {state[0]:.2f} ms, p99 {state[1]:.2f} ms",
+        ]
+
+
+@dataclass
+class Pace:
+    """Real time: every tick has its moment; a step that ends after the next one's has missed its deadline.
+
+    Rule      more than 0.5 s late: the moments start anew
+    Test      tests/test_stream.py::test_realtime
+    """
+
+    dt: float
+    due: float | None = None
+    missed: int = 0
+    restarts: int = 0
+    clock: object = field(default=time.perf_counter)
+    sleep: object = field(default=time.sleep)
+
+    def wait(self):
+        """Sleep until this tick's moment."""
+        now = self.clock()
+        if self.due is None or now - self.due > 0.5:
+            self.restarts += self.due is not None
+            self.due = now
+        self.sleep(max(0.0, self.due - now))
+
+    def done(self):
+        """The step is done."""
+        self.due += self.dt
+        self.missed += self.clock() > self.due
+
+    def report(self) -> list[str]:
+        """Deadlines missed."""
+        late = f", {self.restarts} times more than 0.5 s late" if self.restarts else ""
+        return [f"real time: {self.missed} deadlines missed{late}"]
+
+
+def drive(stream: Stream, samples, player: Player, seconds=None, pace: Pace | None = None, see=None):
+    """Play until the samples end, or for so many seconds.
+
+    Args      samples : Sample, or the seconds (float) without one, as from `arriving`
+              see : function of (player, tick) called after every step; False ends the play
+    Test      tests/test_stream.py::test_round_trip, test_stdin
+    """
+    last = np.inf if seconds is None else round(seconds / player.dt)
+    for sample in samples:
+        for tick in stream.idle(sample) if isinstance(sample, float) else stream.push(sample):
+            if pace:
+                pace.wait()
+            player.step(tick.pos, tick.quat)
+            if pace:
+                pace.done()
+            stop = see(player, tick) is False if see else False
+            if stop or player.ticks >= last:
+                return
