@@ -22,6 +22,8 @@ import resource
 import time
 from dataclasses import dataclass, replace
 
+os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "10")  # as ppo.py does, and says why; before NumPy is loaded
+
 import mujoco
 import numpy as np
 from mujoco import rollout

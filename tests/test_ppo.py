@@ -458,7 +458,7 @@ def test_resume_is_exact_when_disturbed(tmp_path):
 def test_make_env_augments(ref):
     opt = Options(clips="*stand*", envs=5, horizon=4, threads=1, episode=77)
     plain, again = ppo.make_env(opt), ppo.make_env(replace(opt, out="elsewhere"))
-    assert plain.n == 5 and plain.horizon == 77 and plain.ref.names == ["stand_007+1"]
+    assert plain.n == 5 and plain.horizon == 77 and plain.ref.names == ["stand_007"]
     assert ppo.fingerprint(plain.ref) == ppo.fingerprint(again.ref)
     assert plain.disturbance == Disturbance()  # nothing is added unless asked for
     more = replace(opt, augment=True, sensor_offset=0.02, sensor_noise=0.01, push=0.3)

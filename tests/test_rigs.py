@@ -182,11 +182,11 @@ def test_names(name, side, word):
 # ---------------------------------------------------------------- the same human from any rig
 
 
-@pytest.mark.parametrize("style, up, unit", zip(
+@pytest.mark.parametrize("style, up, unit", list(zip(
     STYLES,
     ("y", "z", "y", "x", "y", "-z", "-y", "z", "y"),
     (0.01, 0.01, 1.0, 1.0, 0.0254 / 0.45, 0.0254, 0.001, 1.0, 0.01),
-))  # fmt: skip
+)))  # fmt: skip
 def test_any_rig(tmp_path, capsys, style, up, unit):
     """Guessed from the names alone, with units and axes found: positions exactly, rotations to a few degrees."""
     clip = walk(6.0, turn_rate=0.2)
