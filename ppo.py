@@ -43,7 +43,6 @@ from rigs import HELP, Reading
 from runs import (
     ALL_POSITIVE,
     CHECKPOINT,
-    CONFIG,
     METRICS,
     NONNEGATIVE,
     POSITIVE,
@@ -52,6 +51,7 @@ from runs import (
     Progress,
     UserError,
     arg,
+    check_run,
     cli,
     fmt_count,
     git_state,
@@ -537,8 +537,7 @@ def resumed_options(opt: Options, argv) -> Options:
     Raises    UserError: a given option differs from the stored one
     Test      tests/test_ppo.py::test_resume_refuses_other_options
     """
-    if not (Path(opt.out) / CONFIG).exists():
-        raise UserError(f"{opt.out} holds no run to resume: leave out --resume to start one")
+    check_run(opt.out, resume=True)
     stored = read_config(opt.out)["config"]
     given = {a.split("=")[0].lstrip("-").replace("-", "_") for a in argv if a.startswith("--")}
     values = {}
@@ -582,8 +581,7 @@ def train(opt: Options) -> Trainer:
     out = Path(opt.out)
     loaded = latest_checkpoint(out, ("policy.*",)) if opt.resume else None
     began = time.perf_counter()
-    if not opt.resume and (out / CONFIG).exists():
-        raise UserError(f"{out} already holds a run: add --resume to continue it, or choose another folder")
+    check_run(out, opt.resume)
     # The configuration is checked and the motions are read before the folder is made: a typo leaves nothing behind.
     env = make_env(opt)
     trainer = Trainer(opt, env)

@@ -232,6 +232,20 @@ def git_state(folder=None):
         return {"commit": None, "dirty": None}
 
 
+def check_run(out, resume=False):
+    """Is a run there where one is to be resumed, and none where one is to start?  Call it before slow work.
+
+    Raises    UserError: a run is there already and resume is False; or none is there and resume is True
+    Test      tests/test_runs.py::test_open_run
+    """
+    out = Path(out)
+    there = any((out / name).exists() for name in (CONFIG, CHECKPOINT, PREVIOUS, METRICS))
+    if there and not resume:
+        raise UserError(f"{out} already holds a run: add --resume to continue it, or choose another folder")
+    if resume and not there:
+        raise UserError(f"{out} holds no run to resume: leave out --resume, or name a folder that has {CONFIG}")
+
+
 def open_run(out, config, resume=False):
     """Create the run folder, or reopen it to resume, and write config.json.
 
@@ -242,12 +256,8 @@ def open_run(out, config, resume=False):
     Raises    UserError: a run is there already and resume is False; or none is there and resume is True
     Test      tests/test_runs.py::test_open_run
     """
+    check_run(out, resume)
     out = Path(out)
-    there = any((out / name).exists() for name in (CONFIG, CHECKPOINT, PREVIOUS, METRICS))
-    if there and not resume:
-        raise UserError(f"{out} already holds a run: add --resume to continue it, or choose another folder")
-    if resume and not there:
-        raise UserError(f"{out} holds no run to resume: leave out --resume, or name a folder that has {CONFIG}")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

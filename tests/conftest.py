@@ -1,5 +1,6 @@
 """What every test shares: the repository on the path, software pictures, and the folder of recorded motion."""
 
+import functools
 import os
 import sys
 from pathlib import Path
@@ -26,3 +27,13 @@ def mocap_dir():
     if not Path(name).is_dir():
         pytest.fail(f"MOCAP_DIR={name} is not a folder")
     return Path(name)
+
+
+@pytest.fixture(scope="module")
+def motions_once():
+    """The built-in motions are made once a module, not for every run."""
+    import mocap
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mocap, "builtin_clips", functools.cache(mocap.builtin_clips))
+        yield

@@ -1,7 +1,6 @@
 """The scripts as a user meets them: help, first output, and one clear line for whatever is wrong."""
 
 import dataclasses
-import functools
 import json
 import os
 import re
@@ -35,12 +34,7 @@ RUNS = ("retarget", "ppo", "play")
 TINY = "--clips *stand* --envs 4 --horizon 4 --steps 16 --hidden 8 --value-hidden 8 --threads 1".split()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def motions_once():
-    """The built-in motions are made once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mocap, "builtin_clips", functools.cache(mocap.builtin_clips))
-        yield
+pytestmark = pytest.mark.usefixtures("motions_once")
 
 
 @pytest.fixture

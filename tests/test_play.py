@@ -24,12 +24,7 @@ KEYS = (  # spec: every key of every row
 ).split()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def motions_once():
-    """The built-in motions are made once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mocap, "builtin_clips", functools.cache(mocap.builtin_clips))
-        yield
+pytestmark = pytest.mark.usefixtures("motions_once")
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """PPO: Appendix B's formulas against slow loops, finite differences and torch; the loop's bookkeeping; exact resume."""
 
-import functools
 import itertools
 import json
 import signal
@@ -29,12 +28,7 @@ TIMES = ("steps_per_s", "collect_s", "update_s")
 TINY = "--clips *stand* --envs 8 --horizon 8 --minibatch 32 --hidden 12 --value-hidden 10,8 --threads 1".split()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def motions_once():
-    """The built-in motions are made once, not for every run."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mocap, "builtin_clips", functools.cache(mocap.builtin_clips))
-        yield
+pytestmark = pytest.mark.usefixtures("motions_once")
 
 
 @pytest.fixture(scope="module")
