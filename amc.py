@@ -31,10 +31,10 @@ from typing import NoReturn
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bvh import continuous
+from bvh import continuous, listed
 
 ROOT = "root"
-LIMIT = 1e9  # no length, angle or frame number of a motion is larger; keeps forward kinematics finite
+LIMIT = 1e9  # no length, angle or number of a motion is larger, no unit smaller than its inverse; keeps poses finite
 _SECTIONS = (":version", ":name", ":units", ":documentation", ":root", ":bonedata", ":hierarchy", ":skin")
 _NEEDED = (":units", ":root", ":bonedata", ":hierarchy")
 _KEYS = ("id", "name", "direction", "length", "axis", "dof", "limits", "bodymass", "cofmass")
@@ -80,6 +80,11 @@ def _show(word) -> str:
     """A word for an error message: quoted, on one line, cut to 40 characters."""
     word = word.decode("utf-8", "replace") if isinstance(word, bytes) else word
     return repr(word if len(word) <= 40 else word[:37] + "...")
+
+
+def _plain(name) -> str:
+    """A bone's name for an error message: as `_show`, without quotes."""
+    return _show(name)[1:-1]
 
 
 def _number(word) -> float:
@@ -208,8 +213,9 @@ def _parse_units(path, rows):
     for key in ("mass", "length"):
         line, words = found.get(key, (rows[0][0], ["1"]))
         values[key] = float(_numbers(path, line, f"{key} of :units", words, 1)[0])
-        if values[key] <= 0:
-            _fail(path, f"{key} of :units is {values[key]:g}; expected a positive number", line)
+        if values[key] < 1.0 / LIMIT:
+            valid = f"a positive number of at least {1.0 / LIMIT:g}"
+            _fail(path, f"{key} of :units is {values[key]:g}; expected {valid}", line)
     line, words = found.get("angle", (rows[0][0], []))
     angle = " ".join(words).lower()
     if angle not in ("deg", "rad"):
@@ -310,13 +316,13 @@ def _parse_hierarchy(path, rows, bones):
         else:
             for name in words:
                 if name not in bones:
-                    valid = ", ".join(bones)
-                    _fail(path, f"unknown bone {_show(name)} in :hierarchy; valid: {valid}", line)
+                    _fail(path, f"unknown bone {_show(name)} in :hierarchy; valid: {listed(bones)}", line)
             for child in words[1:]:
                 if child == ROOT or child in parent_of:
-                    above = parent_of.get(child, "none above it")
-                    message = f"{child} is a child of {words[0]} and of {above}; expected one parent"
-                    _fail(path, message if child != ROOT else f"{ROOT} is a child of {words[0]}; expected none", line)
+                    if child == ROOT:
+                        _fail(path, f"{ROOT} is a child of {_plain(words[0])}; expected none", line)
+                    both = f"{_plain(words[0])} and of {_plain(parent_of[child])}"
+                    _fail(path, f"{_plain(child)} is a child of {both}; expected one parent", line)
                 parent_of[child] = words[0]
                 children[words[0]].append(child)
     if state != "after":
@@ -352,39 +358,42 @@ def read_amc(path, skeleton: Skeleton) -> np.ndarray:
     """
     path = os.fspath(path)
     rows = _text(path, "an AMC, which has frame numbers and a line for each bone").split("\n")
-    slots = {name: (k, len(dofs)) for k, (name, dofs) in enumerate(zip(skeleton.names, skeleton.dofs))}
-    empty = [[] if not dofs else None for dofs in skeleton.dofs]
+    # A frame has a place for each bone that moves, and so takes no more room than its lines.
+    moving = [name for name, dofs in zip(skeleton.names, skeleton.dofs) if dofs]
+    slots, dofs_of = {name: k for k, name in enumerate(moving)}, dict(zip(skeleton.names, skeleton.dofs))
     frames, frame, number, degrees = [], None, None, None
     for line, row in enumerate(rows, 1):
         words = row.split()
         if not words:
             continue
         head = words[0]
-        if head in slots and frame is not None:
-            k, count = slots[head]
-            if len(words) != count + 1:
-                valid = f"{count} ({' '.join(skeleton.dofs[k])})" if count else "none"
-                _fail(path, f"{head} has {len(words) - 1} values in frame {number}; expected {valid}", line)
-            if frame[k]:
-                _fail(path, f"{head} again in frame {number}; expected each bone once", line)
-            frame[k] = words[1:]
+        if head in dofs_of and frame is not None:
+            dofs = dofs_of[head]
+            if len(words) != len(dofs) + 1:
+                valid = f"{len(dofs)} ({' '.join(dofs)})" if dofs else "none"
+                _fail(path, f"{_plain(head)} has {len(words) - 1} values in frame {number}; expected {valid}", line)
+            if not dofs:
+                continue
+            if frame[slots[head]]:
+                _fail(path, f"{_plain(head)} again in frame {number}; expected each bone once", line)
+            frame[slots[head]] = words[1:]
         elif head.isdecimal() and len(words) == 1 and len(head) < 19:
             if frame is not None:
-                _check_whole(path, frame, number, skeleton, line)
+                _check_whole(path, frame, number, moving, line)
                 if int(head) != number + 1:
                     _fail(path, f"frame {head} after frame {number}; expected {number + 1}", line)
-            number, frame = int(head), empty.copy()
+            number, frame = int(head), [None] * len(moving)
             frames.append(frame)
         elif head.startswith(":") and frame is None:
             degrees = _parse_keyword(path, head, degrees, line)
         else:
-            valid = f"a frame number or a bone of {skeleton.path}: {', '.join(skeleton.names)}"
+            valid = f"a frame number or a bone of {skeleton.path}: {listed(skeleton.names)}"
             if frame is None:
                 valid = ":FULLY-SPECIFIED, :DEGREES, :RADIANS or the first frame's number"
             _fail(path, f"found {_show(head)}; expected {valid}", line)
     if frame is None:
         _fail(path, "holds no frame; expected at least one (a truncated file?)")
-    _check_whole(path, frame, number, skeleton, len(rows))
+    _check_whole(path, frame, number, moving, len(rows))
 
     flat = [word for frame in frames for words in frame for word in words]
     columns = skeleton.columns
@@ -399,7 +408,9 @@ def read_amc(path, skeleton: Skeleton) -> np.ndarray:
         (bone, dof), at = columns[bad % len(columns)], number - len(frames) + 1 + bad // len(columns)
         line = _line_of(rows, at, bone)
         _fail(
-            path, f"{dof} of {bone} is {_show(flat[bad])} in frame {at}; expected a number of at most {LIMIT:g}", line
+            path,
+            f"{dof} of {_plain(bone)} is {_show(flat[bad])} in frame {at}; expected a number of at most {LIMIT:g}",
+            line,
         )
     values = values.reshape(len(frames), len(columns))
     if skeleton.degrees if degrees is None else degrees:
@@ -419,9 +430,9 @@ def _parse_keyword(path, word, degrees, line):
     return keyword == ":DEGREES"
 
 
-def _check_whole(path, frame, number, skeleton, line):
+def _check_whole(path, frame, number, moving, line):
     if None in frame:
-        missing = skeleton.names[frame.index(None)]
+        missing = _plain(moving[frame.index(None)])
         _fail(path, f"frame {number} ends without {missing}; expected every bone that has a dof", line)
 
 

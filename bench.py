@@ -3,6 +3,7 @@ r"""How fast it is: every part of training beside the physics it cannot beat, in
     python bench.py                                  every character
     python bench.py --character jesse --json OUT     characters.NAME.{physics, environment, inference, update, ...}
     python bench.py --scaling                        1 and all threads, 64 to 4,096 environments
+    python bench.py --physics                        what other steps, solvers and iterations would cost and spoil
 
 physics       bare `mujoco.rollout` of the same model and substeps, from the same states
 environment   `Env.step`: physics, refresh, reward, termination, reset, observation
@@ -28,10 +29,12 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+import character
 import mocap
 import ppo
 import retarget
-from env import SUBSTEPS, Env
+from character import geom_lowest
+from env import BAD, SUBSTEPS, Env
 from nn import gaussian_logp
 from runs import NONNEGATIVE, POSITIVE, arg, atomic_write, cli, run_main, versions
 
@@ -47,6 +50,7 @@ class Options:
     threads: int = arg(0, "physics threads, 0 = all cores", check=NONNEGATIVE)
     rounds: int = arg(7, "how often each part is timed", check=POSITIVE)
     scaling: bool = arg(False, "also the table over threads and environments")
+    physics: bool = arg(False, "the table over physics steps, solvers and iterations instead")
     json: str | None = arg(None, "write the figures here")
 
 
@@ -135,6 +139,52 @@ def policy_step(char, ref, policy, n=2000):
     return float(1e3 * np.percentile(times, 50)), float(1e3 * np.percentile(times, 99))
 
 
+SETTINGS = [  # (substeps, solver, iterations); the first is what the others are compared with
+    (16, "NEWTON", 50), (8, "PGS", 5), (4, "NEWTON", 50), (4, "NEWTON", 3), (4, "CG", 5), (4, "PGS", 3), (4, "PGS", 5),
+    (4, "PGS", 10), (3, "PGS", 5), (2, "PGS", 5),
+]  # fmt: skip
+
+
+def physics_table(char, ref, act, envs=256, seconds=1.0, seed=0, threads=0) -> list[dict]:
+    r"""What another physics step, solver or number of iterations costs, and what it spoils.
+
+    Method    the same characters from the same random frames, driven by `act`, until they fail.  All settings in turn,
+              control step by control step, so that a disturbance of the machine hits all of them.
+    Args      act : function of the Env -> actions (N, u)
+    Returns   for each of SETTINGS: substeps, solver, iterations; control_steps_per_s (median);
+              root_mm : median distance of the root from the first setting's after `seconds`, of those alive in both;
+              sole_mm : mean depth of the lowest sole where it is below the floor; survived : share;
+              bad : simulations that diverged
+    Test      tests/test_bench.py::test_physics_table
+    """
+    options = char.model.opt
+    kept = options.solver, options.iterations, options.timestep
+    steps, runs = round(seconds * ref.rate), []
+    for substeps, solver, iterations in SETTINGS:
+        env = Env(char, ref, envs, seed, threads, substeps=substeps, autoreset=False)
+        env.reset(frames=np.random.default_rng(seed).choice(env.starts[env.starts + steps <= env.starts[-1]], envs))
+        runs.append((env, getattr(mujoco.mjtSolver, f"mjSOL_{solver}"), iterations, [], [], np.ones(envs, bool)))
+    for _ in range(steps):
+        for env, solver, iterations, times, depth, alive in runs:
+            options.solver, options.iterations, options.timestep = solver, iterations, env.dt / env.substeps
+            start = time.perf_counter()
+            terminated = env.step(act(env))[2]
+            times.append(time.perf_counter() - start)
+            alive &= ~terminated
+            low = geom_lowest(char.model, char.sole_geoms.ravel(), env.geom_xpos, env.geom_xmat).min(1)[alive]
+            depth.append(-1000 * low[low < 0])
+    options.solver, options.iterations, options.timestep = kept
+    rows, (best, *_, alive_best) = [], runs[0]
+    for (substeps, solver, iterations), (env, _, _, times, depth, alive) in zip(SETTINGS, runs, strict=True):
+        both = alive & alive_best
+        apart = 1000 * np.linalg.norm(env.qpos[both, :3] - best.qpos[both, :3], axis=1)
+        rows.append({"substeps": substeps, "solver": solver, "iterations": iterations,
+                     "control_steps_per_s": float(envs / np.median(times)), "root_mm": float(np.median(apart)),
+                     "sole_mm": float(np.concatenate(depth).mean()), "survived": float(alive.mean()),
+                     "bad": int((env.batch.warning[:, BAD, 1] > 0).any(1).sum())})  # fmt: skip
+    return rows
+
+
 def _seconds(f, repeats):
     t = time.perf_counter()
     for _ in range(repeats):
@@ -145,14 +195,24 @@ def _seconds(f, repeats):
 def main(argv=None):
     """Print the table of every character.  Test: tests/test_bench.py::test_bench_json"""
     opt = cli(Options, argv, "bench.py", __doc__)
-    names = [opt.character] if opt.character else retarget.available()
+    names = [opt.character] if opt.character else character.available()
     print(
         f"{os.cpu_count()} cores, " + ", ".join(f"{k} {v}" for k, v in versions().items() if k in ("numpy", "mujoco"))
     )
     results = {}
     for name in names:
-        char = retarget.character(name)
+        char = character.load(name)
         ref = retarget.reference(char, mocap.sequences(opt.motion, "train", opt.clips))
+        if opt.physics:
+            policy, _ = ppo.load_policy(character.CHARACTERS / f"{name}.npz")
+            act = lambda env: policy.mean_action(env.full[:, : env.obs_size])  # noqa: B023, E731
+            results[name] = {"settings": physics_table(char, ref, act, opt.envs, threads=opt.threads)}
+            print(f"\n{name}, {opt.envs} characters, its shipped policy, 1 s\n"
+                  "substeps solver iterations  control steps/s  root mm  soles mm  survived  diverged")  # fmt: skip
+            for row in results[name]["settings"]:
+                print("{substeps:8d} {solver:6s} {iterations:10d} {control_steps_per_s:16,.0f} {root_mm:8.1f} "
+                      "{sole_mm:9.1f} {survived:9.2f} {bad:9d}".format(**row))  # fmt: skip
+            continue
         r = results[name] = bench(char, ref, opt)
         print(f"\n{name}, {opt.envs} characters, control steps/s:")
         for k in ("physics", "environment", "inference", "update", "train"):

@@ -29,7 +29,9 @@ from scipy.spatial.transform import Rotation
 CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in "XYZ")
 _CHANNEL = {name.lower(): name for name in CHANNELS}
 _KEYWORDS = {"OFFSET", "CHANNELS", "JOINT", "END", "ROOT", "{", "}"}
-_INDENT_LIMIT = 40  # deeper joints are not indented further, so that a long chain's file stays linear in size
+LIMIT = 1e9  # no offset, position or angle of a file is larger; keeps forward kinematics finite
+FRAME_TIMES = (1e-5, 1.0)  # s; keeps speeds finite, and resampling from making much of little
+_INDENT_LIMIT = 40  # deeper joints are not indented further, so that what is written of a chain is linear in its size
 
 
 class BvhError(ValueError):
@@ -102,6 +104,21 @@ def _show(token) -> str:
     return repr(token if len(token) <= 40 else token[:37] + "...")
 
 
+def listed(names, most=100) -> str:
+    """Names for an error message, the first `most` of them.  Test: tests/test_bvh.py::test_long_lists"""
+    names = list(names)
+    return ", ".join(names[:most]) + (f", … ({len(names)})" if len(names) > most else "")
+
+
+def outline(names, parents) -> list:
+    """A line a joint, indented by how deep it hangs, up to a limit.  Test: tests/test_bvh.py::test_outline"""
+    depth, lines = [], []
+    for name, parent in zip(names, parents):
+        depth.append(depth[parent] + 1 if parent >= 0 else 0)
+        lines.append("  " * min(depth[-1], _INDENT_LIMIT) + name)
+    return lines
+
+
 def _line(data, position) -> int:
     return data.count(b"\n", 0, position) + 1
 
@@ -157,8 +174,9 @@ def _parse_hierarchy(path, text, end):
         taken = [take(f"three numbers after OFFSET of {label}") for _ in range(3)]
         xyz = [_number(word) for word, _ in taken]
         for value, (word, line) in zip(xyz, taken):
-            if value is None or not np.isfinite(value):
-                _fail(path, f"OFFSET of {label} has {_show(word)}; expected three finite numbers", line)
+            if value is None or not abs(value) <= LIMIT:
+                valid = f"three finite numbers of at most {LIMIT:g}"
+                _fail(path, f"OFFSET of {label} has {_show(word)}; expected {valid}", line)
         return np.array(xyz)
 
     def take_channels(label):
@@ -170,7 +188,11 @@ def _parse_hierarchy(path, text, end):
             word, line = take(f"{count} channel names for {label}")
             channel = _CHANNEL.get(word.lower())
             if channel is None and word.upper() in _KEYWORDS:
-                _fail(path, f"{label} lists {len(found)} channels; its CHANNELS count says {count}", line)
+                _fail(
+                    path,
+                    f"{label} lists {len(found)} channels; its CHANNELS count says {count}, expected as many",
+                    line,
+                )
             if channel is None:
                 _fail(path, f"unknown channel {_show(word)} on {label}; valid: {', '.join(CHANNELS)}", line)
             if channel in found:
@@ -225,16 +247,18 @@ def _parse_motion_header(path, data, start):
     """`Frames: N` and `Frame Time: s` from byte start on -> frames, frame_time, the byte where the values begin."""
     found = re.compile(rb"\s*Frames\s*:\s*(\S*)", re.I).match(data, start)
     if not found:
-        _fail(path, "no 'Frames: N' after MOTION", _line(data, start))
+        _fail(path, "no 'Frames: N' after MOTION; expected it there", _line(data, start))
     word, line = found[1], _line(data, found.start(1))
     if not re.fullmatch(rb"\+?0*[1-9][0-9]{0,17}", word):
         _fail(path, f"Frames: {_show(word)}; expected a whole number of at least 1", line)
     time = re.compile(rb"\s*Frame[ \t]*Time\s*:\s*(\S*)", re.I).match(data, found.end())
     if not time:
-        _fail(path, "no 'Frame Time: SECONDS' after Frames", line)
+        _fail(path, "no 'Frame Time: SECONDS' after Frames; expected it there", line)
     frame_time = _number(time[1].decode("latin-1"))
-    if frame_time is None or not 0 < frame_time < np.inf:
-        _fail(path, f"Frame Time: {_show(time[1])}; expected a positive number of seconds", _line(data, time.start(1)))
+    least, most = FRAME_TIMES
+    if frame_time is None or not least <= frame_time <= most:
+        valid = f"a positive number of seconds, {least:g} to {most:g}"
+        _fail(path, f"Frame Time: {_show(time[1])}; expected {valid}", _line(data, time.start(1)))
     return int(word), frame_time, time.end()
 
 
@@ -248,7 +272,11 @@ def _parse_values(path, data, start, frames, names, channels):
         values = np.fromiter(map(float, words), np.float64, len(words))
     except ValueError:
         bad = next(i for i, w in enumerate(words) if _number(w.decode("latin-1")) is None)
-        _fail(path, f"{_show(words[bad])} is not a number ({_cell(bad, columns)})", _line_of_value(data, start, bad))
+        _fail(
+            path,
+            f"{_show(words[bad])} is not a number ({_cell(bad, columns)}); expected one",
+            _line_of_value(data, start, bad),
+        )
     if len(values) != frames * len(columns):
         expected = f"{frames * len(columns)} ({frames} frames x {len(columns)} channels)"
         short = len(values) < frames * len(columns)
@@ -256,9 +284,10 @@ def _parse_values(path, data, start, frames, names, channels):
         rows = enumerate(map(len, map(bytes.split, data[start:].split(b"\n"))), _line(data, start))
         odd = next((f"; line {n} has {found}" for n, found in rows if found not in (0, len(columns))), "")
         _fail(path, f"found {len(values)} values, expected {expected}; they {where}{odd}")
-    if not np.isfinite(values).all():
-        bad = int(np.argmin(np.isfinite(values)))
-        message = f"{_show(words[bad])} in {_cell(bad, columns)}; expected finite numbers"
+    fits = np.abs(values) <= LIMIT
+    if not fits.all():
+        bad = int(np.argmin(fits))
+        message = f"{_show(words[bad])} in {_cell(bad, columns)}; expected finite numbers of at most {LIMIT:g}"
         _fail(path, message, _line_of_value(data, start, bad))
     return values.reshape(frames, len(columns))
 
@@ -463,9 +492,10 @@ def _checked(path, what, value, shape):
     value = np.asarray(value, np.float64)
     if value.shape != shape:
         _fail(path, f"{what} has shape {value.shape}; expected {shape}")
-    if not np.isfinite(value).all():
-        where = np.argwhere(~np.isfinite(value))[0].tolist()
-        _fail(path, f"{what} is {value[tuple(where)]} at {where}; expected finite numbers")
+    fits = np.abs(value) <= LIMIT
+    if not fits.all():
+        where = np.argwhere(~fits)[0].tolist()
+        _fail(path, f"{what} is {value[tuple(where)]} at {where}; expected finite numbers of at most {LIMIT:g}")
     return value
 
 
@@ -479,8 +509,9 @@ def _check_writable(path, names, parents, frame_time, rotations, end_sites, orde
     tree = J and parents.shape == (J,) and parents.dtype.kind in "iu" and parents[0] == -1
     if not tree or any(not 0 <= parents[j] < j for j in range(1, J)):
         _fail(path, f"parents {parents.tolist()} of {J} joints; expected -1, then integer indices of earlier joints")
-    if not 0 < frame_time < np.inf:
-        _fail(path, f"frame time {frame_time}; expected a positive number of seconds")
+    least, most = FRAME_TIMES
+    if not least <= frame_time <= most:
+        _fail(path, f"frame time {frame_time}; expected a positive number of seconds, {least:g} to {most:g}")
     if not T:
         _fail(path, "rotations has zero frames; expected at least 1")
     _checked(path, "rotations", rotations, (T, J, 4))
@@ -491,7 +522,7 @@ def _check_writable(path, names, parents, frame_time, rotations, end_sites, orde
         _fail(path, f"order {order!r}; expected a permutation of 'XYZ'")
     unknown = [name for name in end_sites if name not in names]
     if unknown:
-        _fail(path, f"End Site for {unknown[0]!r}, which is no joint; valid: {', '.join(names)}")
+        _fail(path, f"End Site for {unknown[0]!r}, which is no joint; valid: {listed(names)}")
 
 
 def _euler_degrees(q, order):

@@ -5,21 +5,23 @@ r"""The environment: N characters, each driven by a headset and two controllers 
     observe      Eqs. 2 to 4      what the actor sees: character and sensors, in the heading frame
     privileged   §3.3             what only the critic sees: the human's full pose, now and in the future
     reward_*     Eqs. 5 to 11     one pure function a term; Table 2's weights come from characters/NAME.toml
+    ablated      §3.5.1, §4.3     the same with less reward; `headset_only` (§4.2) and `asymmetric` (§5.3): less to see
     Env          §3.6, §3.7       reset and step as Gymnasium's vector environments have them
 
 After a physics step MuJoCo's positions, velocities and contacts still belong to the state before the last substep;
-`Batch.step(stage=VEL)` recomputes them at the new state.
+`Env.refresh` recomputes positions and velocities at the new state.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
+from character import TERMS, Character, geom_lowest
 from mocap import heading, quat_angle
-from retarget import STAGE_VEL, TERMS, Character, Reference, body_velocity, geom_lowest
+from retarget import STAGE_VEL, Reference, body_velocity
 from runs import UserError, rng_from_state, rng_state
 
 ROOT_LIMIT = 0.30  # m  [Reda23 §3.6]; ASSUMED in 3-D
@@ -27,8 +29,18 @@ FORCE_LIMIT = 1.0  # N  [Reda23 App. A]
 EPISODE_STEPS = 500  # [Reda23 §3.6]
 SUBSTEPS = 4  # ASSUMED: 1/120 s physics at 30 Hz control (a prototype did not learn at 1/60 s)
 FUTURES = (1, 5, 15)  # ASSUMED: future frames shown to the critic, in control steps
+NO_FORCES = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_SENSOR)
 BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
-USER_SIZE = 3 * (3 + 6)
+DEVICE_SIZE = 3 + 6  # position, first two columns of the rotation
+SENSORS = ("full", "hmd")  # what drives the character: headset and two controllers, or the headset alone [§4.2]
+WITHOUT = {  # what can be left out [§4.3, §5.3]: terms of the reward, or what only the critic sees
+    "contact": ("contact",),
+    "orientation": ("orientation",),
+    "action": ("action_diff", "action_min"),
+    "imitation": ("q", "qd", "x", "xd"),
+    "asymmetric": (),
+}
+TRACK = ("all", "root")  # what of the kinematic pose is imitated [§3.5.1]
 
 # ------------------------------------------------------------------------------------ observation
 
@@ -50,11 +62,14 @@ class HeadingFrame:
 
     def turn(self, v, out):
         """Rotate vectors (N, P, 3), or the columns of matrices (N, P, 3, 2), into the frame."""
-        c, s = (self.c, self.s) if v.ndim == 3 else (self.c[..., None], self.s[..., None])
-        x, y, z = v[:, :, 0], v[:, :, 1], v[:, :, 2]
-        out[:, :, 0] = c * x + s * y
-        out[:, :, 1] = c * y - s * x
-        out[:, :, 2] = z
+        if v.ndim == 4:  # one column at a time: NumPy is three times as slow with two in its innermost loop
+            for k in range(2):
+                self.turn(v[..., k], out[..., k])
+            return out
+        x, y = v[..., 0], v[..., 1]
+        out[..., 0] = self.c * x + self.s * y
+        out[..., 1] = self.c * y - self.s * x
+        out[..., 2] = v[..., 2]
         return out
 
     def place(self, p, out):
@@ -63,15 +78,15 @@ class HeadingFrame:
 
 
 def observe_user(frame: HeadingFrame, pos, rot, out):
-    r"""Sensor part of the observation  [Reda23 Eq. 4]: o_user = [h, l, r, R_h, R_l, R_r].
+    r"""Sensor part of the observation  [Reda23 Eq. 4]: o_user = [h, l, r, R_h, R_l, R_r]; [h, R_h] of a headset alone.
 
-    Args      pos (N, 3, 3) [m], rot (N, 3, 3, 2) first two columns of the rotations, world, mapped by the root scale
-              out (N, 27)
-    Test      tests/test_env.py::test_observation_terms
+    Args      pos (N, d, 3) [m], rot (N, d, 3, 2) first two columns of the rotations, world, mapped by the root scale,
+              of d = 3 devices or 1; out (N, 9 d)
+    Test      tests/test_env.py::test_observation_terms, test_headset_only
     """
-    n = len(pos)
-    frame.place(pos, out[:, :9].reshape(n, 3, 3))
-    frame.turn(rot, out[:, 9:].reshape(n, 3, 3, 2))
+    n, d = pos.shape[:2]
+    frame.place(pos, out[:, : 3 * d].reshape(n, d, 3))
+    frame.turn(rot, out[:, 3 * d :].reshape(n, d, 3, 2))
     return out
 
 
@@ -96,22 +111,61 @@ def observe_sim(frame: HeadingFrame, qpos, qvel, spin, link_pos, link_rot, out):
     return out
 
 
-def observation_terms(char: Character) -> dict:
+def observation_terms(char: Character, devices=3, asymmetric=True) -> dict:
     """{"actor": {name: size}, "critic": {name: size}}, in the order of the vector: the actor's [Eq. 2] first.
 
     ASSUMED   o_{t-1,user} is expressed in the frame of time t, so that its difference to o_{t,user} is a velocity.
-    Test      tests/test_env.py::test_observation_terms"""
-    j, links = char.j, len(char.obs_links)
-    actor = dict(q=j, qd=6 + j, x=3 * links, R=6 * links, user_previous=USER_SIZE, user=USER_SIZE)
+    Args      devices : 3, or 1 for a headset alone [§4.2]; asymmetric : the critic sees more than the actor [§5.3]
+    Test      tests/test_env.py::test_observation_terms, test_headset_only, test_symmetric_critic"""
+    j, links, user = char.j, len(char.obs_links), DEVICE_SIZE * devices
+    actor = dict(q=j, qd=6 + j, x=3 * links, R=6 * links, user_previous=user, user=user)
     critic = dict(human_pos=45, human_rot=90) | {f"human_pos_in_{k}": 45 for k in FUTURES}
-    return {"actor": actor, "critic": critic}
+    return {"actor": actor, "critic": critic if asymmetric else {}}
+
+
+def slices_of(terms: dict) -> dict:
+    """Where each term is in the vector: name -> slice.  Test: tests/test_env.py::test_observation_terms"""
+    slices, start = {}, 0
+    for name, size in (terms["actor"] | terms["critic"]).items():
+        slices[name] = slice(start, start + size)
+        start += size
+    return slices
+
+
+def headset_only(ref: Reference) -> Reference:
+    """The reference without controllers; an `Env` of it observes the headset alone  [Reda23 §4.2].
+
+    Test      tests/test_env.py::test_headset_only"""
+    names = ("sensor_pos", "sensor_rot", "sensor_quat")
+    return replace(ref, **{name: np.ascontiguousarray(getattr(ref, name)[:, :1]) for name in names})
+
+
+def input_names(char: Character, devices=3, asymmetric=True) -> list[str]:
+    """A name for every number of the observation, in its order: q.knee_l_y, x.head.2, user.h.R0, human_pos.17, ….
+
+    What two characters, or one with and without controllers, have names for in common, one's policy knows of the other.
+    Args      as of `observation_terms`
+    Test      tests/test_env.py::test_input_names"""
+    links = [char.model.body(b).name for b in char.obs_links]
+    user = [f"{d}.{i}" for d in "hlr"[:devices] for i in "xyz"]
+    user += [f"{d}.R{i}" for d in "hlr"[:devices] for i in range(6)]
+    own = dict(
+        q=char.hinges,
+        qd=["vx", "vy", "vz", "wx", "wy", "wz", *char.hinges],
+        x=[f"{link}.{i}" for link in links for i in "xyz"],
+        R=[f"{link}.R{i}" for link in links for i in range(6)],
+        user_previous=user,
+        user=user,
+    )
+    terms = observation_terms(char, devices, asymmetric)
+    return [f"{t}.{i}" for t, n in (terms["actor"] | terms["critic"]).items() for i in own.get(t, range(n))]
 
 
 def observe(sim, ids, before, now, out) -> HeadingFrame:
     r"""The actor's observation [Reda23 Eq. 2]: o_t = [o_{t,sim}, o_{t-1,user}, o_{t,user}].
 
     Args      sim : has char, slices, and the bound arrays qpos, qvel, cvel, xpos, xmat: an Env, or `stream.Player`
-              ids : rows of it; before, now : (pos, rot) of the sensors as `observe_user` takes them
+              ids : rows of it; before, now : (pos, rot) of the devices as `observe_user` takes them
               out (N, at least the actor's size) is filled
     Returns   the heading frame
     Test      tests/test_env.py::test_observation_terms, tests/test_stream.py::test_player_observes_as_env
@@ -119,9 +173,9 @@ def observe(sim, ids, before, now, out) -> HeadingFrame:
     char, s, links = sim.char, sim.slices, sim.char.obs_links
     qpos, qvel = sim.qpos[ids], sim.qvel[ids]
     frame = HeadingFrame(qpos[:, :3], qpos[:, 3:7])
-    rot = sim.xmat[ids][:, links].reshape(len(qpos), len(links), 3, 3)[..., :2]
-    rows = out[:, s["q"].start : s["R"].stop]
-    observe_sim(frame, qpos, qvel, sim.cvel[ids][:, char.root, :3], sim.xpos[ids][:, links], rot, rows)
+    pos = sim.xpos[ids].take(links, axis=1)
+    rot = sim.xmat[ids].take(links, axis=1).reshape(*pos.shape, 3)[..., :2]
+    observe_sim(frame, qpos, qvel, sim.cvel[ids, char.root, :3], pos, rot, out[:, s["q"].start : s["R"].stop])
     observe_user(frame, *before, out[:, s["user_previous"]])
     observe_user(frame, *now, out[:, s["user"]])
     return frame
@@ -140,11 +194,11 @@ def kernel(w, k, d):
 def weighted_distance(sim, ref, weights):
     r"""[Reda23 Eq. 11] d = Σ_i w_i ‖x_{i,sim} − x_{i,gt}‖²; i runs over joint angles (N, j) or links (N, l, 3).
 
-    The weights come normalised to sum 1 (ASSUMED, `retarget.normalised`).  -> (N,)
+    The weights come normalised to sum 1 (ASSUMED, `character.normalised`).  -> (N,)
     Test      tests/test_env.py::test_reward_terms
     """
-    d = np.square(sim - ref)
-    return (d if d.ndim == 2 else d.sum(-1)) @ weights
+    d = sim - ref
+    return (np.square(d) if d.ndim == 2 else np.einsum("nli,nli->nl", d, d)) @ weights
 
 
 def reward_q(w, k, q_sim, q_kin, weights):
@@ -214,6 +268,32 @@ def total_reward(terms: dict):
     return imitation + terms["contact"] + action
 
 
+def ablated(char: Character, without=(), track="all") -> Character:
+    r"""The character with less reward  [Reda23 §3.5.1, §4.3]: what is left out has weight 0.
+
+    ASSUMED   `imitation` is q, q̇, x and ẋ, what the kinematic pose teaches; orientation, which Eq. 6 counts among
+              them, comes from the human (§3.5.1) and is a name of its own, because §4.3.2 takes it away alone.
+              `track` "root", the least supervision that §3.5.1 speaks of, keeps x of the root; q, q̇ and ẋ go, and
+              orientation stays, which §3.5.1 always rewards
+    Args      without : names in WITHOUT; track : one of TRACK
+    Returns   a copy; the model is shared
+    Raises    UserError: another name, or nothing left to track
+    Test      tests/test_env.py::test_ablated
+    """
+    for name in without:
+        if name not in WITHOUT:
+            raise UserError(f"--without {name}: unknown; valid: {', '.join(WITHOUT)}")
+    if track not in TRACK:
+        raise UserError(f"--track {track}: unknown; valid: {', '.join(TRACK)}")
+    gone = {term for name in without for term in WITHOUT[name]}
+    if track == "root":
+        if "x" in gone or not char.reward["x"][0]:
+            raise UserError("--track root imitates x of the root: it needs x's weight, and no --without imitation")
+        gone |= {"q", "qd", "xd"}
+        char = replace(char, reward_links=np.array([char.root]), link_weights=np.ones(1))
+    return replace(char, reward=char.reward | {term: (0.0, char.reward[term][1]) for term in gone})
+
+
 # ------------------------------------------------------------------------------------ termination
 
 
@@ -256,11 +336,12 @@ class Env:
     As Gymnasium's vector environments with autoreset in the same step: `step` returns the observation of the new
     episode where one ended, and info["final_obs"] the observation it ended with.
 
-    char, ref : `retarget.character`, `retarget.reference`; control runs at the reference's rate
+    char, ref : `character.load`, `retarget.reference`; control runs at the reference's rate
     n         : number of environments
     threads   : physics threads, 0 = all cores; results do not depend on it
     horizon   : control steps to truncation
     disturbance, balance : `Disturbance`, `_draw`
+    asymmetric : the critic's observation has more than the actor's [§5.3]
     autoreset : start anew where an episode ended; without it the caller resets, and reads the state that ended
     """
 
@@ -278,6 +359,7 @@ class Env:
         autoreset=True,
         disturbance=Disturbance(),  # noqa: B008, it is frozen
         balance=False,
+        asymmetric=True,
     ):
         self.char, self.ref, self.n, self.horizon, self.substeps = char, ref, n, horizon, substeps
         self.disturbance = disturbance
@@ -291,22 +373,23 @@ class Env:
         self.xpos, self.xmat, self.xquat = bind("xpos"), bind("xmat"), bind("xquat")
         self.cvel, self.com, self.sensordata = bind("cvel"), bind("subtree_com"), bind("sensordata")
         self.geom_xpos, self.geom_xmat = bind("geom_xpos"), bind("geom_xmat")
-        self.terms = observation_terms(char)
-        self.slices, start = {}, 0
-        for name, size in (self.terms["actor"] | self.terms["critic"]).items():
-            self.slices[name] = slice(start, start + size)
-            start += size
+        self.disabled = self.batch.expand("opt.disableflags")
+        self.devices = ref.sensor_pos.shape[1]  # 1: `headset_only`
+        self.asymmetric = asymmetric
+        self.terms = observation_terms(char, self.devices, asymmetric)
+        self.slices = slices_of(self.terms)
         self.obs_size = sum(self.terms["actor"].values())
-        self.critic_size = start
+        self.critic_size = self.obs_size + sum(self.terms["critic"].values())
         self.action_size = len(char.limits)
-        self.full = np.zeros((n, start), np.float32)  # actor's observation, then the critic's
+        self.full = np.zeros((n, self.critic_size), np.float32)  # actor's observation, then the critic's
         self.frame = np.zeros(n, int)  # reference frame of the present state
         self.sequence = np.zeros(n, int)
         self.steps = np.zeros(n, int)
         self.available = np.ones(n, int)  # control steps from the start to the clip's end or the horizon
         self.action = np.zeros((n, self.action_size))
         self.contact = np.zeros((n, 2), bool)
-        self.sensor_error = np.zeros((n, 3, 9))  # of each device: constant, previous frame's, this frame's
+        # of the devices' positions: constant, previous frame's, this frame's
+        self.sensor_error = np.zeros((n, 3, 3 * self.devices))
         self.rng = np.random.default_rng(seed)
         # a start needs a frame before it (o_{t-1,user}) and one after it
         self.starts = np.concatenate([np.arange(a + 1, b) for a, b in zip(ref.first, ref.last, strict=True)])
@@ -314,10 +397,8 @@ class Env:
             raise UserError(f"{', '.join(ref.names[:3])}: too short; a start needs a sequence of three frames or more")
         self.owner = np.repeat(np.arange(len(ref.first)), ref.last - ref.first + 1)
         self.balance = balance
-        second = self.starts // round(ref.rate)  # `balance` counts by seconds of the reference
-        _, self.bin_first, self.bin_size = np.unique(second, return_index=True, return_counts=True)
-        self.life = np.full(len(self.bin_first), float(horizon))  # of episodes begun there, control steps
-        self.bin = np.zeros(n, int)  # where each environment began
+        self.failed = np.full(len(ref.first), 0.5)  # `balance`: of each sequence, failures and steps lived, of late
+        self.lived = np.full(len(ref.first), float(horizon))
 
     # ---- reset
 
@@ -347,25 +428,50 @@ class Env:
         self.available[ids] = np.minimum(self.horizon, self.ref.last[self.owner[f]] - f)
         self.qpos[ids], self.qvel[ids] = self.ref.qpos[f], self.ref.qvel[f]
         if self.disturbance.sensor_offset:
-            self.sensor_error[ids, 0] = self.disturbance.sensor_offset * self.rng.standard_normal((len(ids), 9))
+            size = self.sensor_error[ids, 0].shape
+            self.sensor_error[ids, 0] = self.disturbance.sensor_offset * self.rng.standard_normal(size)
         self.action[ids], self.ctrl[ids], self.warmstart[ids] = 0.0, 0.0, 0.0
-        self.batch.forward(ids, STAGE_VEL)
+        self.refresh(ids)
 
     def _draw(self, ids):
         r"""Random start frames for the environments ids.
 
-        Equation  uniform over all frames [§3.6]; with `balance` p(second) ∝ frames / mean life of episodes begun there,
-                  so that every second of motion is simulated equally long: where the policy falls it starts often
+        Equation  uniform over all frames [§3.6]; with `balance` half of the simulated time is shared out by frames and
+                  half by frames × rate of failure:  p(sequence) ∝ frames (1 + h / ⟨h⟩) / E[T],
+                  E[T] = (1 − e^{−hH}) / h, within the sequence uniform
+        Symbols   h failures a step, of late (`_count`); ⟨h⟩ its mean over frames; H horizon; T steps of an episode
+        Why       after a while most failures are in a few sequences, and a uniform draw spends its steps on the others
         Returns   (len(ids),) frames
         Test      tests/test_env.py::test_balanced_starts
         """
         if not self.balance:
             return self.rng.choice(self.starts, len(ids))
-        cdf = np.cumsum(self.bin_size / self.life)
-        self.bin[ids] = b = np.searchsorted(cdf, cdf[-1] * self.rng.random(len(ids)), side="right")
-        return self.starts[self.bin_first[b] + (self.bin_size[b] * self.rng.random(len(ids))).astype(int)]
+        frames = self.ref.last - self.ref.first - 1  # that can be started from
+        h = np.maximum(self.failed / self.lived, 1e-6)
+        p = frames * (1.0 + h / np.average(h, weights=frames)) * h / -np.expm1(-h * self.horizon)
+        cdf = np.cumsum(p)
+        k = np.searchsorted(cdf, cdf[-1] * self.rng.random(len(ids)), side="right")
+        return self.ref.first[k] + 1 + (frames[k] * self.rng.random(len(ids))).astype(int)
+
+    def _count(self, done, terminated):
+        """Failures and steps lived of each sequence; of the past nine tenths remain with every episode's end.
+
+        Test      tests/test_env.py::test_balanced_starts"""
+        for i in done:
+            k = self.sequence[i]
+            self.failed[k] = 0.9 * self.failed[k] + terminated[i]
+            self.lived[k] = 0.9 * self.lived[k] + self.steps[i]
 
     # ---- step
+
+    def refresh(self, ids=None):
+        """Positions and velocities of all bodies at the present state, of the environments ids or of all.
+
+        Contacts and limits are left out: nothing reads them between steps, and they cost as much as all the rest.
+        Test      tests/test_env.py::test_kinematics_are_fresh, test_refresh_changes_nothing"""
+        self.disabled |= NO_FORCES
+        self.batch.forward(ids, STAGE_VEL)
+        self.disabled &= ~NO_FORCES
 
     def step(self, action):
         """Advance one control step.
@@ -387,12 +493,14 @@ class Env:
         a = np.clip(action, -1.0, 1.0)  # only the physics sees clipped actions
         self._disturb()
         self.ctrl[:] = a
-        self.batch.step(nstep=self.substeps, stage=STAGE_VEL)
+        self.batch.step(nstep=self.substeps)
+        contact = self._contact()
+        self.refresh()
         self.frame = np.minimum(self.frame + 1, self.ref.last[self.sequence])  # without autoreset the last frame stays
         self.steps += 1
         bad = self._recover()
         f = self.frame
-        self.contact = self._contact() & ~bad[:, None]
+        self.contact = contact & ~bad[:, None]
         terms = self.reward_terms(a)
         if bad.any():
             terms = {name: np.where(bad, 0.0, value) for name, value in terms.items()}
@@ -416,9 +524,8 @@ class Env:
         if len(done):
             info["final_critic"] = self.full.copy()
             info["final_obs"] = info["final_critic"][:, : self.obs_size]
-            if self.balance:  # a truncated episode would have lived on
-                lived, b = np.where(terminated, self.steps, self.horizon)[done], self.bin[done]
-                self.life[b] += 0.3 * (lived - self.life[b])
+            if self.balance:
+                self._count(done, terminated)
             self._reset(done)
             self._observe(done)
         info["critic"] = self.full
@@ -434,7 +541,7 @@ class Env:
             self.qvel[pushed, 1] += size * np.sin(angle)
         if d.sensor_noise:
             self.sensor_error[:, 1] = self.sensor_error[:, 2]
-            self.sensor_error[:, 2] = d.sensor_noise * self.rng.standard_normal((self.n, 9))
+            self.sensor_error[:, 2] = d.sensor_noise * self.rng.standard_normal(self.sensor_error[:, 2].shape)
 
     def _recover(self):
         """Environments whose state is not finite, or that MuJoCo had to reset: put back on the reference, ended as
@@ -448,13 +555,13 @@ class Env:
             self.batch.warning[ids] = 0
             self.qpos[ids], self.qvel[ids] = self.ref.qpos[self.frame[ids]], self.ref.qvel[self.frame[ids]]
             self.warmstart[ids] = 0.0
-            self.batch.forward(ids, STAGE_VEL)
+            self.refresh(ids)
         return bad
 
     def _contact(self):
         """Feet whose normal force on the floor exceeds 1 N during the last substep.  (N, 2) bool
 
-        To be called after a step: `forward` (a reset) computes no forces, and leaves in sensordata whatever simulation
+        To be called right after the physics: `refresh` computes no forces, and leaves in sensordata whatever simulation
         the thread ran before.
 
         Test      tests/test_env.py::test_contact_forces"""
@@ -465,13 +572,13 @@ class Env:
 
         Test      tests/test_env.py::test_reward_terms, test_zero_weight_adds_nothing"""
         c, ref, f, r = self.char, self.ref, self.frame, self.char.reward
-        links = c.reward_links
+        links, ends = c.reward_links, [c.root, c.head]
         values = dict(
             q=lambda w, k: reward_q(w, k, self.qpos[:, 7:], ref.qpos[f, 7:], c.joint_weights),
             qd=lambda w, k: reward_qd(w, k, self.qvel[:, 6:], ref.qvel[f, 6:], c.joint_weights),
-            x=lambda w, k: reward_x(w, k, self.xpos[:, links], ref.link_pos[f], c.link_weights),
+            x=lambda w, k: reward_x(w, k, self.xpos.take(links, axis=1), ref.link_pos[f], c.link_weights),
             xd=lambda w, k: reward_xd(w, k, self.link_velocity(), ref.link_vel[f], c.link_weights),
-            orientation=lambda w, k: reward_orientation(w, k, self.xquat[:, [c.root, c.head]], ref.orientation[f]),
+            orientation=lambda w, k: reward_orientation(w, k, self.xquat.take(ends, axis=1), ref.orientation[f]),
             contact=lambda w, k: reward_contact(w, k, self.contact, ref.contact[f]),
             action_diff=lambda w, k: reward_action_diff(w, k, self.action, a),
             action_min=lambda w, k: reward_action_min(w, k, a),
@@ -483,31 +590,39 @@ class Env:
 
         Test      tests/test_env.py::test_kinematics_are_fresh"""
         links = self.char.reward_links
-        return body_velocity(self.cvel[:, links], self.xpos[:, links], self.com[:, self.char.root])
+        return body_velocity(self.cvel.take(links, axis=1), self.xpos.take(links, axis=1), self.com[:, self.char.root])
 
     # ---- observation
 
     def _observe(self, ids):
         """Fill the rows `ids` of self.full (a slice or indices)."""
         ref, f = self.ref, self.frame[ids]
-        n = len(f)
-        out = self.full[ids] if not isinstance(ids, slice) else self.full
+        n, every = len(f), isinstance(ids, slice)
+        out = self.full if every else np.empty((n, self.critic_size), np.float32)
         s = self.slices
         before = np.maximum(f - 1, ref.first[self.sequence[ids]])  # a sequence's first frame has none before it
         user = [(ref.sensor_pos[k], ref.sensor_rot[k]) for k in (before, f)]
         frame = observe(self, ids, *user, out)
         if self.disturbance.sensor_offset or self.disturbance.sensor_noise:
             constant, previous, present = np.moveaxis(self.sensor_error[ids], 1, 0)  # in the heading frame
-            out[:, s["user_previous"]][:, :9] += constant + previous
-            out[:, s["user"]][:, :9] += constant + present
-        last = ref.last[self.sequence[ids]]
+            out[:, s["user_previous"]][:, : 3 * self.devices] += constant + previous
+            out[:, s["user"]][:, : 3 * self.devices] += constant + present
+        if self.asymmetric:
+            self._observe_human(frame, ids, out)
+        if not every:
+            self.full[ids] = out
+
+    def _observe_human(self, frame, ids, out):
+        """What only the critic sees  [Reda23 §3.3]: the human's pose, and its joints in the future.
+
+        Test      tests/test_env.py::test_observation_terms"""
+        ref, f, s = self.ref, self.frame[ids], self.slices
+        n = len(f)
         frame.place(ref.human_pos[f], out[:, s["human_pos"]].reshape(n, 15, 3))
         frame.turn(ref.human_rot[f], out[:, s["human_rot"]].reshape(n, 15, 3, 2))
-        for k in FUTURES:
-            ahead = np.minimum(f + k, last)
-            frame.place(ref.human_pos[ahead], out[:, s[f"human_pos_in_{k}"]].reshape(n, 15, 3))
-        if not isinstance(ids, slice):
-            self.full[ids] = out
+        ahead = np.minimum(np.add.outer(f, FUTURES), ref.last[self.sequence[ids]][:, None])  # (n, futures)
+        futures = out[:, s["human_rot"].stop :].reshape(n, -1, 3)
+        frame.place(ref.human_pos[ahead].reshape(futures.shape), futures)
 
     # ---- exact resume
 
@@ -515,21 +630,30 @@ class Env:
         """Arrays and JSON that `load_state` continues from bit-exactly.
 
         Test      tests/test_env.py::test_state_continues_exactly, tests/test_ppo.py::test_resume_is_exact"""
-        arrays = {
-            k: getattr(self, k).copy() for k in ("frame", "steps", "available", "action", "sensor_error", "life", "bin")
-        }
+        names = ("frame", "steps", "available", "action", "sensor_error", "failed", "lived")
+        arrays = {k: getattr(self, k).copy() for k in names}
         return {"state": self.batch.state.copy()} | arrays, {"rng": rng_state(self.rng)}
 
     def load_state(self, arrays, meta):
         """Continue from what `state` returned.  -> obs, info as from `reset`
 
-        Test      tests/test_env.py::test_state_continues_exactly"""
+        Raises    ValueError: another environment's state
+        Test      tests/test_env.py::test_state_continues_exactly, tests/test_fuzz.py::test_run_folders"""
+        own = {"state": self.batch.state} | {k: getattr(self, k) for k in self.state()[0] if k != "state"}
+        for name, need in own.items():
+            have = arrays[name]
+            if have.shape != need.shape or have.dtype.kind != need.dtype.kind or not np.isfinite(have).all():
+                raise ValueError(f"env.{name} is {have.dtype} {have.shape}, expected finite {need.dtype} {need.shape}")
+            if name not in ("state", "action", "sensor_error") and have.min(initial=0) < 0:
+                raise ValueError(f"env.{name} is negative")
+        if arrays["frame"].max() >= len(self.ref):
+            raise ValueError(f"env.frame is beyond the motions' {len(self.ref)} frames")
         self.batch.state[:] = arrays["state"]
         self.frame[:], self.steps[:], self.action[:] = arrays["frame"], arrays["steps"], arrays["action"]
         self.available[:] = arrays["available"]
-        self.sensor_error[:], self.life[:], self.bin[:] = arrays["sensor_error"], arrays["life"], arrays["bin"]
+        self.sensor_error[:], self.failed[:], self.lived[:] = (arrays[k] for k in ("sensor_error", "failed", "lived"))
         self.sequence[:] = self.owner[self.frame]
         self.rng = rng_from_state(meta["rng"])
-        self.batch.forward(None, STAGE_VEL)
+        self.refresh()
         self._observe(slice(None))
         return self.full[:, : self.obs_size], {"critic": self.full}

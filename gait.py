@@ -38,8 +38,23 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.ndimage import convolve1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
-SEGMENTS = ("pelvis", "chest", "head", "thigh_l", "shin_l", "foot_l", "thigh_r", "shin_r", "foot_r",
-            "upper_arm_l", "forearm_l", "hand_l", "upper_arm_r", "forearm_r", "hand_r")
+SEGMENTS = (
+    "pelvis",
+    "chest",
+    "head",
+    "thigh_l",
+    "shin_l",
+    "foot_l",
+    "thigh_r",
+    "shin_r",
+    "foot_r",
+    "upper_arm_l",
+    "forearm_l",
+    "hand_l",
+    "upper_arm_r",
+    "forearm_r",
+    "hand_r",
+)
 KINDS = ("walk", "jog", "turn", "start", "stop", "stand", "sidestep", "gesture")
 GRAVITY = 9.81
 DEG = np.pi / 180.0
@@ -62,10 +77,46 @@ WALK_DUTY, JOG_DUTY = 0.58, 0.36
 # Pitch of the foot to the floor [deg], toe up +, in per cent of the stride. Walking: hip - knee + ankle of the curves
 # above, with 10..31 per cent levelled to flat (the sum stays within 4 degrees there). Jogging: the same sum of the
 # curves of [Novacheck98], thigh to the vertical.
-PITCH_WALK = np.array([[0, 17], [5, 5], [10, 0], [31, 0], [40, -6], [45, -12.5], [50, -23], [55, -41], [60, -60],
-                       [65, -68], [70, -62], [75, -49], [80, -32], [85, -14], [90, 3], [95, 14], [100, 17.0]])
-PITCH_JOG = np.array([[0, 8], [3, 3], [6, 0], [19, 0], [25, -12], [32, -38], [38, -60], [45, -76], [55, -84],
-                      [65, -74], [75, -44], [85, -10], [92, 4], [97, 8], [100, 8.0]])
+PITCH_WALK = np.array(
+    [
+        [0, 17],
+        [5, 5],
+        [10, 0],
+        [31, 0],
+        [40, -6],
+        [45, -12.5],
+        [50, -23],
+        [55, -41],
+        [60, -60],
+        [65, -68],
+        [70, -62],
+        [75, -49],
+        [80, -32],
+        [85, -14],
+        [90, 3],
+        [95, 14],
+        [100, 17.0],
+    ]
+)
+PITCH_JOG = np.array(
+    [
+        [0, 8],
+        [3, 3],
+        [6, 0],
+        [19, 0],
+        [25, -12],
+        [32, -38],
+        [38, -60],
+        [45, -76],
+        [55, -84],
+        [65, -74],
+        [75, -44],
+        [85, -10],
+        [92, 4],
+        [97, 8],
+        [100, 8.0],
+    ]
+)
 
 
 def walk_angles(phase):
@@ -93,6 +144,7 @@ class Body:
     Args      height : stature [m]
     Test      tests/test_gait.py::test_body_fractions
     """
+
     height: float = 1.75
 
     thigh = property(lambda self: 0.245 * self.height)
@@ -104,17 +156,23 @@ class Body:
     hip_half_width = property(lambda self: 0.050 * self.height)
     chest = property(lambda self: np.array([-0.010, 0.0, 0.100]) * self.height, doc="chest base in the pelvis frame")
     head = property(lambda self: np.array([0.010, 0.0, 0.280]) * self.height, doc="head joint in the chest frame")
-    shoulder = property(lambda self: np.array([0.005, 0.108, 0.188]) * self.height,
-                        doc="left shoulder in the chest frame; the right one has -y")
-    heel = property(lambda self: np.array([-0.25 * 0.152, 0.0, -0.039]) * self.height,
-                    doc="lowest point of the heel in the foot frame")
-    ball = property(lambda self: np.array([0.47 * 0.152, 0.0, 0.014 - 0.039]) * self.height,
-                    doc="ball joint in the foot frame")
+    shoulder = property(
+        lambda self: np.array([0.005, 0.108, 0.188]) * self.height,
+        doc="left shoulder in the chest frame; the right one has -y",
+    )
+    heel = property(
+        lambda self: np.array([-0.25 * 0.152, 0.0, -0.039]) * self.height,
+        doc="lowest point of the heel in the foot frame",
+    )
+    ball = property(
+        lambda self: np.array([0.47 * 0.152, 0.0, 0.014 - 0.039]) * self.height, doc="ball joint in the foot frame"
+    )
 
 
 @dataclass(frozen=True)
 class GaitParams:
     """What a clip can be asked for; `generate` fills kind-dependent defaults."""
+
     speed: float = 1.3  # forward speed [m/s]
     cadence: float | None = None  # steps per minute; None: normative from speed
     stride: float | None = None  # stride length [m], instead of cadence
@@ -127,8 +185,15 @@ class GaitParams:
     variation: float = 1.0  # 0 removes all randomness, 1 is natural
 
 
-DEFAULTS = {"jog": {"speed": 2.5}, "turn": {"turn_rate": 0.5}, "start": {"speed": 1.2}, "stop": {"speed": 1.2},
-            "stand": {"speed": 0.0}, "sidestep": {"speed": 0.0, "sidestep": 0.35}, "gesture": {"speed": 0.0}}
+DEFAULTS = {
+    "jog": {"speed": 2.5},
+    "turn": {"turn_rate": 0.5},
+    "start": {"speed": 1.2},
+    "stop": {"speed": 1.2},
+    "stand": {"speed": 0.0},
+    "sidestep": {"speed": 0.0, "sidestep": 0.35},
+    "gesture": {"speed": 0.0},
+}
 
 # ASSUMED arm poses [deg]: shoulder flexion, abduction, inward rotation, elbow flexion, for the arms that take part.
 GESTURES = {
@@ -346,8 +411,10 @@ def _foot(plan, body, p, style, side, scale):
     x, y, yaw, lift, frac, s = (a[plan.pick] for a in _footholds(plan, p, style, side))
     keys, duty = (PITCH_JOG, JOG_DUTY) if plan.jog else (PITCH_WALK, WALK_DUTY)
     at = np.where(s > 0, duty + s * (1 - duty), frac / plan.duty * duty)  # phase of the published curve
-    curve = PchipInterpolator(np.concatenate([keys[:-1, 0] - 100, keys[:-1, 0], keys[:, 0] + 100]),
-                              np.concatenate([keys[:-1, 1], keys[:-1, 1], keys[:, 1]]))
+    curve = PchipInterpolator(
+        np.concatenate([keys[:-1, 0] - 100, keys[:-1, 0], keys[:, 0] + 100]),
+        np.concatenate([keys[:-1, 1], keys[:-1, 1], keys[:, 1]]),
+    )
     pitch = curve(at * 100) * DEG * scale
     flat = keys[keys[:, 1] == 0, 0][:2] / 100
     to_ball = smooth((at - flat[0]) / (flat[1] - flat[0])) * (1 - smooth(s))  # pivot: heel 0 .. ball 1
@@ -393,11 +460,19 @@ def _arm_base(plan, phase, gate, amount, rng, p):
         swing = -np.cos(2 * np.pi * (phase - o + 0.02))  # back at the heel strike of the same side
         drift = 2.0 * p.variation * _noise(rng, plan.t[plan.pick], 0.4)
         if plan.jog:  # ASSUMED 85 degrees of elbow, forearms slightly inward
-            out[:, j] = np.stack([-12 + 26 * amount * swing + drift, 0 * phase + 17, 0 * phase + 14,
-                                  85 + 12 * swing], 1)
+            out[:, j] = np.stack(
+                [-12 + 26 * amount * swing + drift, 0 * phase + 17, 0 * phase + 14, 85 + 12 * swing], 1
+            )
         else:  # [Murray67] about 30 degrees of shoulder and 15..35 of elbow at 1.3 m/s
-            out[:, j] = np.stack([-3 + (-4 + 17 * swing) * amount * gate + drift, 0 * phase + 8 + 0.4 * drift,
-                                  0 * phase + 8, 14 + (9 + 9 * swing) * amount * gate + np.abs(drift)], 1)
+            out[:, j] = np.stack(
+                [
+                    -3 + (-4 + 17 * swing) * amount * gate + drift,
+                    0 * phase + 8 + 0.4 * drift,
+                    0 * phase + 8,
+                    14 + (9 + 9 * swing) * amount * gate + np.abs(drift),
+                ],
+                1,
+            )
     return out * DEG
 
 
@@ -452,12 +527,28 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
     body, plan = Body(p.height), _Plan(kind, duration, rate, p, rng)
     size = p.height / 1.75
     vary = lambda sd: 1 + sd * p.variation * np.clip(rng.standard_normal(), -2, 2)  # noqa: E731
-    walk = {"step_half": 0.055 * vary(0.1), "lift": 2.6 * vary(0.1), "ahead": -0.10, "usual": 1.4, "around": 0.02,
-            "knee": (6 + 5 * max(p.speed - 1.2, 0.0)) * DEG}
-    jog = {"step_half": 0.04 * vary(0.1), "lift": 2.1 * vary(0.1), "ahead": -0.08, "usual": 1.9, "around": 0.03,
-           "knee": 12 * DEG}
-    style = {**(jog if plan.jog else walk), "stand_half": 0.085 * vary(0.1), "toe_out": 6 * DEG * vary(0.2),
-             "lean": 0.6}
+    walk = {
+        "step_half": 0.055 * vary(0.1),
+        "lift": 2.6 * vary(0.1),
+        "ahead": -0.10,
+        "usual": 1.4,
+        "around": 0.02,
+        "knee": (6 + 5 * max(p.speed - 1.2, 0.0)) * DEG,
+    }
+    jog = {
+        "step_half": 0.04 * vary(0.1),
+        "lift": 2.1 * vary(0.1),
+        "ahead": -0.08,
+        "usual": 1.9,
+        "around": 0.03,
+        "knee": 12 * DEG,
+    }
+    style = {
+        **(jog if plan.jog else walk),
+        "stand_half": 0.085 * vary(0.1),
+        "toe_out": 6 * DEG * vary(0.2),
+        "lean": 0.6,
+    }
     for key in ("step_half", "lift", "ahead", "usual", "stand_half", "around"):
         style[key] *= size
     if kind == "sidestep":
@@ -499,8 +590,13 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
     hips = [pelvis + _apply(r_pelvis, np.array([0, sgn * body.hip_half_width, 0])) for sgn in (1, -1)]
     reach = np.sqrt(body.thigh**2 + body.shin**2 + 2 * body.thigh * body.shin * np.cos(style["knee"]))
     flat = [np.sum((h - f[0])[:, :2] ** 2, 1) for h, f in zip(hips, feet, strict=True)]
-    limit = np.min([f[0][:, 2] + np.sqrt(np.maximum(reach**2 - d, 0.2 * reach**2)) - h[:, 2]
-                    for h, f, d in zip(hips, feet, flat, strict=True)], axis=0)
+    limit = np.min(
+        [
+            f[0][:, 2] + np.sqrt(np.maximum(reach**2 - d, 0.2 * reach**2)) - h[:, 2]
+            for h, f, d in zip(hips, feet, flat, strict=True)
+        ],
+        axis=0,
+    )
     crouch = 0.045 * size if plan.jog else 0.0
     height = _lowered(body.thigh + body.shin + body.ankle_height - crouch + up, limit, rate)
     pelvis[:, 2] += height
@@ -535,21 +631,37 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
     flip = np.where(np.sum(quat[1:] * quat[:-1], -1) < 0, -1.0, 1.0)
     first = np.where(quat[:1, :, 0] < 0, -1.0, 1.0)
     quat *= np.cumprod(np.concatenate([first, flip]), 0)[..., None]
-    return {"pos": np.stack([poss[k] for k in SEGMENTS], 1), "quat": quat, "ball": ball, "rate": float(rate),
-            "name": f"{kind}_{seed}"}
+    return {
+        "pos": np.stack([poss[k] for k in SEGMENTS], 1),
+        "quat": quat,
+        "ball": ball,
+        "rate": float(rate),
+        "name": f"{kind}_{seed}",
+    }
 
 
 # The mix of `library`: kind and the ranges its parameters are drawn from, in an order that covers every kind early.
 MIX = (
-    ("walk", {"speed": (1.1, 1.4)}), ("turn", {"speed": (0.8, 1.2), "turn_rate": (0.3, 0.6)}),
-    ("stand", {}), ("start", {"speed": (0.9, 1.3)}), ("jog", {"speed": (2.3, 2.7)}),
-    ("gesture", {}), ("sidestep", {"sidestep": (0.25, 0.45)}), ("walk", {"speed": (0.5, 0.8)}),
-    ("turn", {"speed": (0.7, 1.0), "turn_rate": (-1.0, -0.6)}), ("stop", {"speed": (1.0, 1.4)}),
-    ("walk", {"speed": (1.4, 1.6)}), ("gesture", {"speed": (0.7, 1.2)}), ("jog", {"speed": (2.0, 2.4)}),
-    ("turn", {"speed": (0.9, 1.3), "turn_rate": (0.5, 0.9), "weave": (True,)}), ("walk", {"speed": (0.8, 1.1)}),
-    ("start", {"speed": (0.6, 1.0)}), ("sidestep", {"sidestep": (-0.45, -0.25)}),
+    ("walk", {"speed": (1.1, 1.4)}),
+    ("turn", {"speed": (0.8, 1.2), "turn_rate": (0.3, 0.6)}),
+    ("stand", {}),
+    ("start", {"speed": (0.9, 1.3)}),
+    ("jog", {"speed": (2.3, 2.7)}),
+    ("gesture", {}),
+    ("sidestep", {"sidestep": (0.25, 0.45)}),
+    ("walk", {"speed": (0.5, 0.8)}),
+    ("turn", {"speed": (0.7, 1.0), "turn_rate": (-1.0, -0.6)}),
+    ("stop", {"speed": (1.0, 1.4)}),
+    ("walk", {"speed": (1.4, 1.6)}),
+    ("gesture", {"speed": (0.7, 1.2)}),
+    ("jog", {"speed": (2.0, 2.4)}),
+    ("turn", {"speed": (0.9, 1.3), "turn_rate": (0.5, 0.9), "weave": (True,)}),
+    ("walk", {"speed": (0.8, 1.1)}),
+    ("start", {"speed": (0.6, 1.0)}),
+    ("sidestep", {"sidestep": (-0.45, -0.25)}),
     ("jog", {"speed": (2.6, 3.0), "turn_rate": (-0.3, 0.3)}),
-    ("turn", {"speed": (0.6, 0.9), "turn_rate": (0.7, 1.0)}), ("walk", {"speed": (1.2, 1.5), "turn_rate": (-0.2, 0.2)}),
+    ("turn", {"speed": (0.6, 0.9), "turn_rate": (0.7, 1.0)}),
+    ("walk", {"speed": (1.2, 1.5), "turn_rate": (-0.2, 0.2)}),
 )
 
 
@@ -622,8 +734,10 @@ def main(argv=None):
         n = len(clip["pos"])
         step = np.linalg.norm(np.diff(clip["pos"][:, 0, :2], axis=0), axis=1).sum() * clip["rate"] / (n - 1)
         slide, sink = foot_report(clip)
-        print(f"{clip['name']:<14}{n / clip['rate']:>8.1f}{body_of(clip).height:>8.2f}{step:>7.2f}{slide:>11.3f}"
-              f"{sink:>9.4f}")
+        print(
+            f"{clip['name']:<14}{n / clip['rate']:>8.1f}{body_of(clip).height:>8.2f}{step:>7.2f}{slide:>11.3f}"
+            f"{sink:>9.4f}"
+        )
 
 
 if __name__ == "__main__":

@@ -68,9 +68,12 @@ def quat_about(axis: int, angle):
 
 
 def quat_angle(a, b):
-    """Geodesic angle |log(a b⁻¹)| in [0, π]; q and −q are one rotation.  Test: test_mocap.py::test_quaternions."""
-    r = quat_mul(a, quat_conj(b))
-    return 2.0 * np.arctan2(np.linalg.norm(r[..., 1:], axis=-1), np.abs(r[..., 0]))
+    """Geodesic angle θ = |log(a b⁻¹)| in [0, π] of unit quaternions; q and −q are one rotation.
+
+    Equation  |a − b| = 2 sin θ/4, |a + b| = 2 cos θ/4, or the other way round where a·b < 0
+    Test      test_mocap.py::test_quaternions"""
+    half = np.sum(np.square(a - b), -1), np.sum(np.square(a + b), -1)
+    return 4.0 * np.arctan2(np.sqrt(np.minimum(*half)), np.sqrt(np.maximum(*half)))
 
 
 def quat_slerp(a, b, t):

@@ -24,13 +24,15 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 
+import character
 import mocap
 import retarget
 import stream
+from character import Character
 from env import EPISODE_STEPS, Env
 from mocap import heading, quat_angle, quat_conj, quat_mul, quat_rotate
 from ppo import check_fits, load_policy
-from retarget import Character, Reference, forward_kinematics, sole_motion
+from retarget import Reference, forward_kinematics, sole_motion
 from rigs import HELP, Reading
 from runs import NONNEGATIVE, POSITIVE, UserError, arg, atomic_write, cli, run_main
 from stream import AXES, SAMPLE_RATE
@@ -478,7 +480,7 @@ def pictures(char: Character, ref: Reference, recording: Recording, frames, size
     """
     import render
 
-    shown = retarget.character(char.path, visual=True).model
+    shown = char.mjspec().compile()
     scene = render.Scene(shown, *size, fast=fast)
     data = mujoco.MjData(shown)
     images = []
@@ -540,7 +542,7 @@ def _shown_model(char: Character, ref: Reference):
     """
     import render
 
-    spec = mujoco.MjSpec.from_file(str(char.path.parent / char.spec.get("model", char.path.stem + ".xml")))
+    spec = char.mjspec()
     for i, device in enumerate(render.device_markers(ref.sensor_pos[0], ref.sensor_quat[0])):
         body = spec.worldbody.add_body(name=f"sensor {i}", mocap=True)
         look = dict(contype=0, conaffinity=0, group=1)
@@ -678,7 +680,7 @@ def _write_pictures(char, ref, recording, last, opt):
 def find_policy(opt: Options):
     """The policy named, or the shipped one; UserError says how to make one."""
     name = Path(opt.character)
-    shipped = name.with_suffix(".npz") if name.suffix == ".toml" else retarget.CHARACTERS / f"{name}.npz"
+    shipped = name.with_suffix(".npz") if name.suffix == ".toml" else character.CHARACTERS / f"{name}.npz"
     path = Path(opt.policy) if opt.policy else shipped
     if not path.exists():
         make = f"python ppo.py --character {opt.character} --out runs/a"
@@ -705,7 +707,7 @@ def main(argv=None):
             raise UserError(f"cannot write {out}: there is no folder {Path(out).parent}")
     if opt.json and not opt.measure:
         raise UserError("--json writes the table of --measure: give both")
-    char = retarget.character(opt.character)
+    char = character.load(opt.character)
     policy, path = find_policy(opt)
     if opt.stream:
         play_stream(char, policy, path, opt)

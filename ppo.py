@@ -24,9 +24,21 @@ os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "10")
 
 import numpy as np
 
+import character
 import mocap
 import retarget
-from env import EPISODE_STEPS, Disturbance, Env
+from character import TERMS
+from env import (
+    EPISODE_STEPS,
+    SENSORS,
+    TRACK,
+    WITHOUT,
+    Disturbance,
+    Env,
+    ablated,
+    headset_only,
+    input_names,
+)
 from nn import (
     MLP,
     Adam,
@@ -37,8 +49,8 @@ from nn import (
     gaussian_logp,
     gaussian_logp_backward,
     value_loss,
+    widened,
 )
-from retarget import TERMS
 from rigs import HELP, Reading
 from runs import (
     ALL_POSITIVE,
@@ -58,25 +70,27 @@ from runs import (
     latest_checkpoint,
     load_checkpoint,
     open_run,
-    read_config,
     rng_from_state,
     rng_state,
     run_main,
     save_checkpoint,
+    stored_options,
     versions,
 )
 
+FINITE = ("policy.*", "adam_*", "env.*")  # of a checkpoint's arrays
+WEIGHT_LIMIT, NORM_LIMIT = 1e6, 1e30  # no weight of a policy, no sum of its normaliser is larger: float32 stays finite
 BELOW_ONE = (lambda v: 0 < v < 1, "between 0 and 1")
+NOISE = {"sigma": 0.135, "min_sigma": 0.05}  # where neither the command line nor the character's [training] says
 
 
 @dataclass
-class Options:
+class Options(character.Switches):
     """Everything a run is made of.
 
     Table 3 of the paper (its hyper-parameters) is not in the text we work from: these are ASSUMED, from measured runs.
     """
 
-    character: str = arg("jesse", "name in characters/, or path of a .toml")
     motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names, such as '*walk*'")
     joint_map: str | None = arg(None, HELP["joint_map"])
@@ -103,14 +117,24 @@ class Options:
     max_grad_norm: float = arg(1.0, "gradient norm limit", check=POSITIVE)
     hidden: tuple[int, ...] = arg((256, 128), "hidden layers of the policy", check=ALL_POSITIVE)
     value_hidden: tuple[int, ...] = arg((256, 128), "hidden layers of the value network", check=ALL_POSITIVE)
-    sigma: float = arg(0.135, "standard deviation of the exploration noise at the start", check=POSITIVE)
-    min_sigma: float = arg(0.05, "below this the standard deviations do not fall", check=POSITIVE)
+    sigma: float | None = arg(
+        None, "standard deviation of the exploration noise at the start: the character's, or 0.135", check=POSITIVE
+    )
+    min_sigma: float | None = arg(
+        None, "below this the standard deviations do not fall: the character's, or 0.05", check=POSITIVE
+    )
     balance: bool = arg(False, "start more often where episodes end soon, so that all motion is simulated equally long")
     augment: bool = arg(False, "also mirrored clips at other speeds, by users of other heights and arm lengths")
     sensor_offset: float = arg(0.0, "constant error of device positions in an episode [m]", check=NONNEGATIVE)
     sensor_noise: float = arg(0.0, "white noise on device positions [m]", check=NONNEGATIVE)
     push: float = arg(0.0, "largest random push, every 2 s on average [m/s]", check=NONNEGATIVE)
     episode: int = arg(EPISODE_STEPS, "control steps to truncation [§3.6]", check=POSITIVE)
+    sensors: str = arg("full", "what it sees of the user [§4.2]: full, or hmd, the headset alone", choices=SENSORS)
+    without: tuple[str, ...] = arg(
+        (), f"what to leave out [§4.3, §5.3], one or several of {','.join(WITHOUT)}",
+        check=(lambda v: set(v) <= set(WITHOUT), f"one or several of {', '.join(WITHOUT)}"), metavar="NAME,…",
+    )  # fmt: skip
+    track: str = arg("all", "what it imitates of the kinematic pose [§3.5.1]: all, or the root's place", choices=TRACK)
 
 
 # ------------------------------------------------------------------------------------ Appendix B
@@ -267,8 +291,63 @@ class Policy:
         for name, own in (("policy.pi", self.theta_pi), ("policy.critic", self.critic.theta)):
             if arrays[name].shape != own.shape:
                 raise ValueError(f"{name} has shape {arrays[name].shape}, expected {own.shape}")
+            if arrays[name].dtype.kind != "f" or not np.all(np.abs(arrays[name]) <= WEIGHT_LIMIT):
+                raise ValueError(f"{name} holds no weights, valid: numbers of at most {WEIGHT_LIMIT:g}")
             own[:] = arrays[name]
-        self.norm.load_state({k: arrays[f"policy.norm.{k}"] for k in ("count", "mean", "m2")})
+        count, mean, m2 = (arrays[f"policy.norm.{k}"] for k in ("count", "mean", "m2"))
+        if count.dtype.kind not in "iu" or mean.dtype.kind != "f" or m2.dtype.kind != "f" or count.min() < 0:
+            raise ValueError("policy.norm holds no count, mean and sum of squares")
+        if not np.all(np.abs(mean) <= NORM_LIMIT) or not np.all((m2 >= 0) & (m2 <= NORM_LIMIT)):
+            raise ValueError(f"policy.norm's numbers are beyond 0 and {NORM_LIMIT:g}")
+        self.norm.load_state(dict(count=count, mean=mean, m2=m2))
+
+    def rearranged(self, inputs, obs_size, outputs) -> Policy:
+        """The same policy with other inputs and outputs: one left out is as if it stayed at its mean, a new one is
+        ignored, a new action is 0.
+
+        Args      inputs : (critic,) which of this policy's inputs each is, -1 for a new one, the actor's first;
+                  obs_size : how many the actor has; outputs : (u,) the same of the actions
+        Test      tests/test_ppo.py::test_init_headset_only, test_init_of_another_character"""
+        inputs, outputs = np.asarray(inputs), np.asarray(outputs)
+        sizes = obs_size, len(inputs), len(outputs), self.hidden, self.value_hidden
+        out = Policy(*sizes, 1.0, self.value_scale, np.random.default_rng(0), self.theta_pi.dtype)
+        for mine, its, rows in ((self.actor, out.actor, inputs[:obs_size]), (self.critic, out.critic, inputs)):
+            last = mine.n_layers - 1
+            for name, value in mine.params.items():
+                if name == "W0":
+                    value = value[rows] * (rows >= 0)[:, None]
+                if its is out.actor and name in (f"W{last}", f"b{last}"):
+                    value = value[..., outputs] * (outputs >= 0)
+                its.params[name][:] = value
+        out.log_std[:] = np.where(outputs >= 0, self.log_std[outputs], self.log_std.mean())
+        state = {k: v if k == "count" else v[inputs] for k, v in self.norm.state().items()}
+        state["mean"] = np.where(inputs >= 0, state["mean"], 0.0)
+        state["m2"] = np.where(inputs >= 0, state["m2"], float(state["count"]))
+        out.norm.load_state(state)
+        return out
+
+    def begin_from(self, other: Policy, path, rng):
+        """Take over another policy's function; its networks may be narrower (`nn.widened`).
+
+        Where this critic sees no more than the actor [§5.3] and the other's does, it stays as it was made.
+        Raises    UserError, naming path: another depth, a wider layer, or another critic's observation
+        Test      tests/test_ppo.py::test_init_widens, test_init_symmetric"""
+        anew = self.critic_size == self.obs_size < other.critic_size
+        try:
+            actor = widened(other.actor, self.actor.sizes, rng)
+            critic = self.critic if anew else widened(other.critic, self.critic.sizes, rng)
+        except ValueError:
+            raise UserError(
+                f"{path}: its networks are {other.hidden} and {other.value_hidden}, with {other.critic_size} inputs "
+                "for the critic: give --hidden and --value-hidden as many layers, none smaller"
+            ) from None
+        self.theta_pi[:] = np.concatenate([actor.theta, other.log_std])
+        self.critic.theta[:] = critic.theta
+        seen = {k: v if k == "count" else v[: self.critic_size] for k, v in other.norm.state().items()}
+        self.norm.load_state(seen)
+        if anew:
+            sees = f"its critic sees {other.critic_size} numbers, this one's only the actor's {self.obs_size}"
+            print(f"{path}: {sees}: the critic begins anew")
 
 
 def load_policy(path) -> tuple[Policy, dict]:
@@ -285,13 +364,29 @@ def load_policy(path) -> tuple[Policy, dict]:
         raise UserError(f"{path}: holds no checkpoint; valid: a run folder with {CHECKPOINT}, or a policy's .npz")
     arrays, meta = loaded
     try:
-        shape = dict(meta["policy"])
+        shape = _checked_shape(meta["policy"], arrays)
         policy = Policy(sigma=1.0, rng=np.random.default_rng(0), **shape)
         policy.load(arrays)
     except (KeyError, TypeError, ValueError) as e:
         raise UserError(f"{path}: not a policy ({e}); valid: a checkpoint that ppo.py wrote") from None
     policy.norm.frozen = True
     return policy, meta
+
+
+def _checked_shape(shape, arrays) -> dict:
+    """The networks' sizes, if the arrays have them: nothing is made that the file does not hold.  ValueError if not"""
+    shape = dict(shape)
+    layers = {k: [shape[f"{k}_size"], *shape[h]] for k, h in (("obs", "hidden"), ("critic", "value_hidden"))}
+    layers = {"policy.pi": [*layers["obs"], shape["action_size"]], "policy.critic": [*layers["critic"], 1]}
+    for name, sizes in layers.items():
+        if not all(type(n) is int and n > 0 for n in sizes):
+            raise ValueError(f"layers of {str(sizes)[:80]}, valid: integers greater than 0")
+        weights = sum((a + 1) * b for a, b in zip(sizes, sizes[1:])) + (sizes[-1] if name == "policy.pi" else 0)
+        if arrays[name].shape != (weights,):
+            raise ValueError(f"{name} has shape {arrays[name].shape}, expected {(weights,)} for layers of {sizes}")
+    if type(shape["value_scale"]) not in (int, float) or not shape["value_scale"] > 0:
+        raise ValueError(f"value_scale is {str(shape['value_scale'])[:80]}, valid: a number greater than 0")
+    return shape
 
 
 def ship(run, path) -> dict:
@@ -302,7 +397,10 @@ def ship(run, path) -> dict:
     Test      tests/test_ppo.py::test_ship
     """
     policy, meta = load_policy(run)
-    motion = meta["options"]["motion"]
+    try:
+        motion, _, _, _ = str(meta["options"]["motion"]), meta["options"]["init"], meta["steps"], meta["data"]
+    except (KeyError, TypeError) as e:
+        raise UserError(f"{run}: does not say how it was trained ({e}); valid: a folder that ppo.py wrote") from None
     notes = sorted(Path(motion).glob("LICENSE*")) if Path(motion).is_dir() else []
     title = (
         notes[0].read_text(errors="replace").strip().split("\n")[0] if notes else "no licence file beside the motion"
@@ -335,7 +433,8 @@ class Trainer:
     """
 
     def __init__(self, opt: Options, env: Env):
-        self.opt, self.env = opt, env
+        noise = {k: v for k, v in (NOISE | env.char.training).items() if getattr(opt, k) is None}
+        self.opt, self.env = (opt := replace(opt, **noise)), env
         self.rng = np.random.default_rng([opt.seed, 1])
         weights = sum(env.char.reward[t][0] for t in TERMS)
         scale = weights / max(1.0 - opt.gamma, 1e-3)  # the largest return
@@ -493,17 +592,31 @@ class Trainer:
         )
         save_checkpoint(path, arrays, meta | own)
 
-    def restore(self, arrays, meta):
-        """Continue bit-exactly from what `save` wrote.  UserError: something else was saved"""
+    def restore(self, arrays, meta, path="the checkpoint"):
+        """Continue bit-exactly from what `save` wrote.  UserError, naming path: something else was saved"""
         try:
+            for key in ("steps", "updates", "rows"):
+                if type(meta.get(key, 0)) is not int or meta.get(key, 0) < 0:
+                    raise ValueError(f"{key} is {str(meta[key])[:80]}, valid: an integer of at least 0")
+            if type(meta["lr"]) not in (int, float) or not meta["lr"] > 0:
+                raise ValueError(f"lr is {str(meta['lr'])[:80]}, valid: a number greater than 0")
             self.policy.load(arrays)
             for name, adam in (("adam_pi", self.adam_pi), ("adam_v", self.adam_v)):
-                adam.load_state({k: arrays[f"{name}.{k}"] for k in ("t", "m", "v")})
+                state = {k: arrays[f"{name}.{k}"] for k in ("t", "m", "v")}
+                if {a.dtype for a in state.values()} != {np.dtype(np.int64), adam.m.dtype} or state["t"].min() < 0:
+                    raise ValueError(f"{name} holds no optimiser's state")
+                if not np.all(state["v"] >= 0):
+                    raise ValueError(f"{name}.v is negative")
+                adam.load_state(state)
             self.adam_pi.lr, self.steps, self.updates = meta["lr"], meta["steps"], meta["updates"]
             self.rng = rng_from_state(meta["rng"])
             self.env.load_state({k[4:]: v for k, v in arrays.items() if k.startswith("env.")}, meta["env"])
         except (KeyError, TypeError, ValueError) as e:
-            raise UserError(f"the checkpoint does not fit this run ({e}); start a new one with --init") from None
+            raise UserError(
+                f"{path}: does not fit this run ({type(e).__name__}: {e}); give another --out, with --init {path}"
+            ) from None
+        except UserError as e:
+            raise UserError(f"{path}: {e}") from None
 
 
 def fingerprint(ref) -> str:
@@ -519,13 +632,64 @@ def make_env(opt: Options) -> Env:
 
     Test      tests/test_ppo.py::test_make_env_augments
     """
-    char = retarget.character(opt.character)
+    char = ablated(opt.load(), opt.without, opt.track)
     clips = mocap.sequences(opt.motion, "train", opt.clips, seed=opt.seed, reading=Reading.of(opt))
     if opt.augment:
         clips = mocap.augment(clips, np.random.default_rng([opt.seed, 3]))
     disturbance = Disturbance(opt.sensor_offset, opt.sensor_noise, opt.push)
     ref = retarget.reference(char, clips)
-    return Env(char, ref, opt.envs, opt.seed, opt.threads, opt.episode, disturbance=disturbance, balance=opt.balance)
+    return Env(
+        char, headset_only(ref) if opt.sensors == "hmd" else ref, opt.envs, opt.seed, opt.threads, opt.episode,
+        disturbance=disturbance, balance=opt.balance, asymmetric="asymmetric" not in opt.without,
+    )  # fmt: skip
+
+
+def initial_policy(path, env: Env, sigma) -> Policy:
+    """The policy of --init, rearranged by the names of inputs and joints where it is another character's or knows more.
+
+    Of one with controllers the inputs that remain without them go on [§4.2].  Another character's policy keeps what the
+    two have names for in common; its normaliser and σ begin anew, because the sizes are others.
+    Raises    UserError: it does not fit; it knows the headset alone and the run has controllers
+    Test      tests/test_ppo.py::test_init_headset_only, test_init_of_another_character"""
+    policy, meta = load_policy(path)
+    trained = sensors_of(meta, path)
+    if trained == "hmd" and env.devices == 3:
+        raise UserError(f"{path}: was trained with the headset alone: give --sensors hmd")
+    source = meta["options"].get("character") if isinstance(meta.get("options"), dict) else None
+    if not isinstance(source, str):
+        check_fits(policy, env, path)
+        return policy
+    same = source in (env.char.name, str(env.char.path))
+    char = env.char if same else character.load(source)
+    devices, asymmetric = (3 if trained == "full" else 1), policy.critic_size > policy.obs_size
+    have = input_names(char, devices, asymmetric), [char.hinges[h] for h in char.driven]
+    need = input_names(env.char, env.devices, asymmetric), [env.char.hinges[h] for h in env.char.driven]
+    if have == need or (len(have[0]), len(have[1])) != (policy.critic_size, policy.action_size):
+        check_fits(policy, env, path)
+        return policy
+    inputs, outputs = (
+        [names.index(n) if n in names else -1 for n in wanted] for names, wanted in zip(have, need, strict=True)
+    )
+    policy = policy.rearranged(inputs, env.obs_size, outputs)
+    if not same:
+        policy.norm.load_state(RunningNorm(policy.critic_size).state())
+        policy.log_std[:] = np.log(sigma)
+        print(
+            f"{path}: {char.name}'s policy: {sum(i >= 0 for i in inputs)} of {len(inputs)} inputs and "
+            f"{sum(i >= 0 for i in outputs)} of {len(outputs)} torques have the same names here and go on"
+        )
+    return policy
+
+
+def sensors_of(meta, path) -> str:
+    """What a policy was trained to see, "full" or "hmd".  UserError: its options say something else
+
+    Test      tests/test_ppo.py::test_init_headset_only"""
+    options = meta.get("options", {})
+    found = options.get("sensors", "full") if isinstance(options, dict) else options
+    if found not in SENSORS:
+        raise UserError(f"{path}: its options have sensors {str(found)[:80]!r}; valid: {', '.join(SENSORS)}")
+    return found
 
 
 CHANGEABLE = ("steps", "threads", "checkpoint_minutes", "resume", "out")
@@ -538,12 +702,11 @@ def resumed_options(opt: Options, argv) -> Options:
     Test      tests/test_ppo.py::test_resume_refuses_other_options
     """
     check_run(opt.out, resume=True)
-    stored = read_config(opt.out)["config"]
+    stored = stored_options(Options, opt.out)
     given = {a.split("=")[0].lstrip("-").replace("-", "_") for a in argv if a.startswith("--")}
     values = {}
     for f in fields(Options):
         value = stored.get(f.name, getattr(opt, f.name))
-        value = tuple(value) if isinstance(value, list) else value
         if f.name in given and getattr(opt, f.name) != value:
             if f.name not in CHANGEABLE:
                 raise UserError(
@@ -579,35 +742,30 @@ class StopFlag:
 def train(opt: Options) -> Trainer:
     """Run, or resume, a training run.  Test: tests/test_ppo.py::test_resume_is_exact, tests/test_cli.py::test_ppo"""
     out = Path(opt.out)
-    loaded = latest_checkpoint(out, ("policy.*",)) if opt.resume else None
+    loaded = latest_checkpoint(out, FINITE) if opt.resume else None
     began = time.perf_counter()
     check_run(out, opt.resume)
     # The configuration is checked and the motions are read before the folder is made: a typo leaves nothing behind.
     env = make_env(opt)
     trainer = Trainer(opt, env)
+    opt = trainer.opt
     if opt.init and not loaded:  # a run resumed before its first checkpoint begins as it began
-        policy, _ = load_policy(opt.init)
-        check_fits(policy, env, opt.init)
-        sizes = lambda p: (p.critic_size, p.hidden, p.value_hidden)  # noqa: E731
-        if sizes(policy) != sizes(trainer.policy):
-            raise UserError(
-                f"{opt.init}: its networks are {policy.hidden}, {policy.value_hidden}: "
-                "give --hidden and --value-hidden to match"
-            )
-        trainer.policy.load(policy.arrays())
+        policy = initial_policy(opt.init, env, opt.sigma)
+        trainer.policy.begin_from(policy, opt.init, np.random.default_rng([opt.seed, 4]))
         np.maximum(trainer.policy.log_std, np.log(opt.min_sigma), out=trainer.policy.log_std)
     data = {"fingerprint": fingerprint(env.ref), "sequences": len(env.ref.names), "minutes": len(env.ref) * env.dt / 60}
-    if loaded and loaded[1].get("data", data)["fingerprint"] != data["fingerprint"]:
+    before = loaded[1].get("data", data) if loaded else data
+    if not isinstance(before, dict) or before.get("fingerprint") != data["fingerprint"]:
         raise UserError(
-            f"{out}: the motions have changed since the run began ({loaded[1]['data']} against {data}); "
+            f"{out}: the motions have changed since the run began ({before} against {data}); "
             f"start a new run with --init {out}"
         )
     if loaded:
-        trainer.restore(*loaded)
+        trainer.restore(*loaded, out / CHECKPOINT)
     else:
         trainer.start()
     open_run(out, asdict(opt) | {"data": data}, opt.resume)
-    metrics = Metrics(out / METRICS, loaded[1]["rows"] if loaded else None)
+    metrics = Metrics(out / METRICS, loaded[1].get("rows", 0) if loaded else None)
     meta = {"options": asdict(opt), "data": data}
     progress = Progress(opt.steps, trainer.steps)
     print(

@@ -1,30 +1,29 @@
-r"""Characters, and human pose -> character pose  [Reda23 §3.2, §3.4, §3.7].
+r"""Human pose -> character pose  [Reda23 §3.4].
 
-    NAME.xml + NAME.toml ──► Character       the model with its tables, each checked against the other
     Clip ──► retarget ──► qpos, qvel         joint map, default pose, scaled root
          └─► reference ──► Reference         everything the environment compares with, one row a control step
 
 The kinematic pose slides, floats and sinks: it is a training signal, not a result.
 
     python retarget.py --character jesse --motion PATH [--png OUT | --video OUT | --bvh OUT]
+    python retarget.py --check NAME.xml      what is missing for a character of one's own
 """
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
 from scipy.spatial.transform import Rotation
 
 import bvh
+import character
 import mocap
+from character import Character, geom_lowest
 from mocap import (
     SEG,
-    SEGMENTS,
     Clip,
     angular_velocity,
     linear_velocity,
@@ -37,424 +36,9 @@ from mocap import (
 from rigs import HELP, Reading
 from runs import UserError, arg, cli, run_main
 
-CHARACTERS = Path(__file__).resolve().parent / "characters"
-TERMS = ("q", "qd", "x", "xd", "contact", "orientation", "action_diff", "action_min")  # Table 2's rows
 STAGE_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 
-# ------------------------------------------------------------------------------------ the character
-
-
-@dataclass
-class Character:
-    """A MuJoCo model with the tables of its TOML resolved to indices and arrays.
-
-    nq = 7 + j, nv = 6 + j for j hinges; u of them are driven (have a motor).  Hinge arrays are in model order.
-    """
-
-    name: str
-    path: Path  # of the TOML
-    model: mujoco.MjModel  # collision shapes only, gains of the TOML: what is simulated
-    spec: dict  # the TOML
-    hinges: list[str]
-    ranges: np.ndarray  # (j, 2) rad; infinite where the hinge has no range
-    default: np.ndarray  # (j,) rad, default pose
-    limits: np.ndarray  # (u,) N m, base × Table 4
-    driven: np.ndarray  # (u,) hinge index of each motor
-    root: int  # body id
-    head: int
-    hip_height: float  # m, root above the soles in the default pose
-    chains: list  # (body, hinge indices, axes, from, to, shares) in tree order
-    mapped: np.ndarray  # (j,) bool, hinges that follow the human
-    obs_links: np.ndarray  # body ids
-    reward_links: np.ndarray  # body ids
-    link_weights: np.ndarray  # normalised to sum 1 (Eq. 11)
-    joint_weights: np.ndarray  # (j,) normalised to sum 1 (Eq. 11)
-    reward: dict  # term -> (w, k), and "fail"
-    feet: np.ndarray  # (2,) body ids
-    sole_geoms: np.ndarray  # (2, g) collision geoms of each foot
-    contact_adr: np.ndarray  # (2,) address of the normal force in sensordata
-    sensor_sites: np.ndarray  # (3,)
-    fall_geoms: np.ndarray  # (f,) collision geoms that must not touch the floor
-
-    @property
-    def j(self):
-        return len(self.hinges)
-
-    def batch(self, n: int, threads: int = 0) -> Batch:
-        """n simulations of this character.
-
-        MuJoCo's own thread pool steps them; results do not depend on the number of threads."""
-        return Batch(self.model, n, threads, persistent=False)
-
-
-def available() -> list[str]:
-    """Names of the characters that can be loaded.  Test: tests/test_retarget.py::test_character_checks"""
-    return sorted(p.stem for p in CHARACTERS.glob("*.toml"))
-
-
-def character(name: str | Path, visual=False) -> Character:
-    """Load characters/NAME.toml and its model, or a path to a TOML file; check both against each other.
-
-    Args      visual : keep the shapes that are only looked at (they cost time in every step)
-    Raises    UserError: names the file, what is missing or does not match, and what would have been valid
-    Test      tests/test_retarget.py::test_character_tables, test_character_checks
-    """
-    path = Path(name) if str(name).endswith(".toml") else CHARACTERS / f"{name}.toml"
-    if not path.is_file():
-        known = ", ".join(available())
-        raise UserError(f"no character {str(name)!r}; there are: {known}; or give the path of a .toml file")
-    try:
-        spec = tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-        raise UserError(f"{path}: {e}") from None
-    return _Loader(path, spec, visual).load()
-
-
-class _Loader:
-    """Resolves the TOML's names in the model; every complaint names the file, the table and what would be valid."""
-
-    KEYS = dict(  # what each table may hold; None: names that are checked where they are used
-        root=("body", "scale_xy", "scale_z"),
-        map=None,
-        torque=("base", "scale"),
-        passive=("stiffness", "damping", "armature"),
-        observation=("links",),
-        reward=(*TERMS, "fail", "joints", "links"),
-        feet=("bodies", "contact_sensors"),
-        sensors=("sites",),
-        fall=("bodies",),
-        pose=None,
-        metrics=("sip",),
-    )
-    TABLES = tuple(t for t in KEYS if t not in ("pose", "metrics"))  # those that must be there
-    SHAPES = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
-
-    def __init__(self, path, spec, visual):
-        self.path, self.spec = path, spec
-        for table in self.TABLES:
-            if not isinstance(spec.get(table), dict):
-                self.fail(f"has no table [{table}]; needed: {', '.join(self.TABLES)}")
-        for name, value in spec.items():
-            if name not in (*self.KEYS, "name", "model"):
-                self.fail(f"has {name!r}, which means nothing; valid: name, model, {', '.join(self.KEYS)}")
-            for key in value if self.KEYS.get(name) else ():
-                if key not in self.KEYS[name]:
-                    self.fail(f"[{name}] has {key!r}, which means nothing; valid: {', '.join(self.KEYS[name])}")
-        self.xml = path.parent / str(spec.get("model", path.stem + ".xml"))
-        if not self.xml.is_file():
-            found = ", ".join(sorted(p.name for p in path.parent.glob("*.xml"))) or "none"
-            self.fail(f"model = {self.xml.name!r} is not a file beside it; .xml files there: {found}")
-        try:
-            mjspec = mujoco.MjSpec.from_file(str(self.xml))
-            for geom in list(mjspec.geoms) if not visual else []:
-                if geom.contype == 0 and geom.conaffinity == 0:
-                    mjspec.delete(geom)
-            self.model = mjspec.compile()
-        except ValueError as e:
-            self.fail_xml(" ".join(str(e).split()))
-
-    def load(self) -> Character:
-        m, spec = self.model, self.spec
-        names, ranges = self.skeleton()
-        default = self.default_pose(names)
-        driven, limits = self.torques(names)
-        self.passive(names, driven)
-        chains, mapped = self.chains(names)
-        root = self.root()
-        feet, soles, contact_adr = self.feet()
-        links = self.get("reward", "links", dict)
-        link_weights = [self.number(f"[reward.links] {n}", w, 0) for n, w in links.items()]
-        sites = self.ids("sensors", self.get("sensors", "sites", list), mujoco.mjtObj.mjOBJ_SITE, "site")
-        if len(sites) != 3:
-            self.fail(f"[sensors] needs three sites (head, left, right), found {len(sites)}")
-        data = mujoco.MjData(m)
-        data.qpos[7:] = default
-        mujoco.mj_kinematics(m, data)
-        lowest = geom_lowest(m, soles.ravel(), data.geom_xpos[None], data.geom_xmat[None]).min()
-        return Character(
-            name=str(spec.get("name", self.path.stem)),
-            path=self.path,
-            model=m,
-            spec=spec,
-            hinges=names,
-            ranges=ranges,
-            default=default,
-            limits=limits,
-            driven=driven,
-            root=root,
-            head=int(self.bodies("map", [self.body_for("head")])[0]),
-            hip_height=float(data.xpos[root, 2] - lowest),
-            chains=chains,
-            mapped=mapped,
-            obs_links=self.bodies("observation", self.get("observation", "links", list)),
-            reward_links=self.bodies("reward.links", links),
-            link_weights=normalised(link_weights),
-            joint_weights=self.joint_weights(names, mapped),
-            reward=self.rewards(),
-            feet=feet,
-            sole_geoms=soles,
-            contact_adr=contact_adr,
-            sensor_sites=sites,
-            fall_geoms=self.collision_geoms("fall", self.get("fall", "bodies", list)),
-        )
-
-    # ---- complaints and look-ups
-
-    def fail(self, text):
-        raise UserError(f"{self.path}: {text}")
-
-    def fail_xml(self, text):
-        raise UserError(f"{self.xml}: {text}")
-
-    def number(self, where, value, least=None):
-        """`value` if it is a finite number (and at least `least`)."""
-        if not isinstance(value, (int, float)) or isinstance(value, bool) or not np.isfinite(value):
-            self.fail(f"{where} = {value!r} is not a finite number")
-        if least is not None and value < least:
-            self.fail(f"{where} = {value!r} must be at least {least}")
-        return value
-
-    def get(self, table, key, kind):
-        """spec[table][key], which must be a str, list, dict or float (any finite number)."""
-        value = self.spec[table].get(key)
-        if value is None:
-            self.fail(f"[{table}] has no {key}; it has {', '.join(self.spec[table]) or 'nothing'}")
-        if kind is float:
-            return float(self.number(f"[{table}] {key}", value))
-        if not isinstance(value, kind):
-            self.fail(f"[{table}] {key} = {value!r} is not a {kind.__name__}")
-        return value
-
-    def ids(self, table, names, obj, what):
-        count = {"body": self.model.nbody, "site": self.model.nsite, "sensor": self.model.nsensor}[what]
-        out = []
-        for n in names:
-            i = mujoco.mj_name2id(self.model, obj, str(n))
-            if i < 0:
-                valid = ", ".join(filter(None, (mujoco.mj_id2name(self.model, obj, k) for k in range(count))))
-                self.fail(f"[{table}] names {what} {n!r}, which {self.xml.name} lacks; it has {valid}")
-            out.append(i)
-        return np.array(out, dtype=int)
-
-    def bodies(self, table, names):
-        return self.ids(table, names, mujoco.mjtObj.mjOBJ_BODY, "body")
-
-    def collision_geoms(self, table, names):
-        """Ids of the bodies' geoms that the floor can touch; only shapes that `geom_lowest` knows."""
-        m = self.model
-        found = [np.flatnonzero((m.geom_bodyid == b) & (m.geom_conaffinity != 0)) for b in self.bodies(table, names)]
-        geoms = np.concatenate(found) if found else np.zeros(0, int)
-        if not len(geoms):
-            self.fail(f"[{table}] bodies = {names!r} have no geom that the floor can touch (conaffinity 1)")
-        if not np.isin(m.geom_type[geoms], [int(s) for s in self.SHAPES]).all():
-            self.fail(f"[{table}] bodies = {names!r} have collision geoms of other types than sphere, capsule and box")
-        return geoms
-
-    # ---- the parts
-
-    def skeleton(self):
-        """Names and ranges of the hinges, and what the rest of this code takes for granted about the model."""
-        m, kinds = self.model, mujoco.mjtJoint
-        if m.njnt < 2 or m.jnt_type[0] != kinds.mjJNT_FREE or np.any(m.jnt_type[1:] != kinds.mjJNT_HINGE):
-            self.fail_xml("the first joint must be free and all others hinges")
-        if not np.allclose(np.abs(m.jnt_axis[1:]).max(axis=1), 1.0):
-            self.fail_xml("every hinge must turn about one axis of its body's frame (x, y or z)")
-        floors = (m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (m.geom_bodyid == 0) & (m.geom_pos[:, 2] == 0.0)
-        if not floors.any():
-            self.fail_xml("needs a floor: a geom of type plane at height 0 in the world body")
-        names = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_JOINT, k) for k in range(1, m.njnt)]
-        limited = m.jnt_limited[1:].astype(bool)
-        widest = np.abs(m.jnt_range[1:])[limited].max(initial=0.0)
-        if limited.any() and widest < 0.1:
-            self.fail_xml("joint ranges look like degrees read as radians; set <compiler angle='radian'/>")
-        if widest > 2 * np.pi:
-            worst = names[np.abs(m.jnt_range[1:]).max(axis=1).argmax()]
-            self.fail_xml(f"the range of hinge {worst} reaches {widest:.0f} rad: it looks like degrees; write radians")
-        return names, np.where(limited[:, None], m.jnt_range[1:], [-np.inf, np.inf])
-
-    def default_pose(self, names):
-        """[pose]: angles of the default pose, where the passive springs pull to as well."""
-        default, pose = np.zeros(len(names)), self.spec.get("pose", {})
-        if not isinstance(pose, dict):
-            self.fail(f"pose = {pose!r} is not a table of joint = angle")
-        for joint, value in pose.items():
-            if joint not in names:
-                self.fail(f"[pose] names joint {joint!r}; valid: {', '.join(names)}")
-            if abs(self.number(f"[pose] {joint}", value)) > 2 * np.pi:
-                self.fail(f"[pose] {joint} = {value!r} looks like degrees; write radians")
-            default[names.index(joint)] = value
-        self.model.qpos_spring[7:] = default
-        return default
-
-    def root(self):
-        m = self.model
-        root, free = int(self.bodies("root", [self.get("root", "body", str)])[0]), int(m.jnt_bodyid[0])
-        if root != free:
-            self.fail(f"[root] body = {m.body(root).name!r} must be the body of the free joint, {m.body(free).name!r}")
-        for key in ("scale_xy", "scale_z"):
-            value = self.spec["root"].get(key, 1.0)
-            if isinstance(value, str) and not (key == "scale_z" and value == "hip"):
-                self.fail(f"[root] {key} = {value!r}; valid: a number" + (' or "hip"' if key == "scale_z" else ""))
-            if value != "hip" and self.number(f"[root] {key}", value) <= 0:
-                self.fail(f"[root] {key} = {value!r} must be greater than 0")
-        return root
-
-    def feet(self):
-        """Body ids (2,), sole geoms (2, g), addresses of the normal forces (2,)."""
-        m, names = self.model, self.get("feet", "bodies", list)
-        feet = self.bodies("feet", names)
-        contact = self.ids("feet", self.get("feet", "contact_sensors", list), mujoco.mjtObj.mjOBJ_SENSOR, "sensor")
-        if len(feet) != 2 or len(contact) != 2:
-            found = f"{len(feet)} and {len(contact)}"
-            self.fail(f"[feet] needs two bodies and two contact_sensors (left, right), found {found}")
-        soles = [self.collision_geoms("feet", [n]) for n in names]
-        if len(soles[0]) != len(soles[1]):
-            self.fail(f"[feet] bodies need as many collision geoms each, found {len(soles[0])} and {len(soles[1])}")
-        # A sensor of one number is the normal force; of a vector, world axes, its last number (z) is.
-        return feet, np.stack(soles), m.sensor_adr[contact] + (m.sensor_dim[contact] - 1)
-
-    def by_group(self, table, key, groups):
-        """A table of numbers by joint group ("spine1", or "spine" for all of spine0, spine1, …), names checked."""
-        values = {g.lower(): self.number(f"[{table}.{key}] {g}", v, 0) for g, v in self.get(table, key, dict).items()}
-        valid = groups | {g.rstrip("0123456789") for g in groups} | {"default"}
-        for g in values:
-            if g not in valid:
-                self.fail(f"[{table}.{key}] names {g!r}; the model's driven joints are {', '.join(sorted(groups))}")
-        return lambda g: values.get(g, values.get(g.rstrip("0123456789"), values.get("default")))
-
-    def torques(self, names):
-        """Hinge and limit of each motor: base by joint group times Table 4's scale; written into the motors' gear."""
-        m = self.model
-        driven = m.actuator_trnid[:, 0] - 1
-        if np.any(m.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT) or np.any(driven < 0) or len(set(driven)) < m.nu:
-            self.fail_xml("every actuator must be a motor on a hinge of its own")
-        groups = {joint_group(names[h]) for h in driven}
-        base, scale = (self.by_group("torque", key, groups) for key in ("base", "scale"))
-        limits = np.zeros(len(driven))
-        for k, h in enumerate(driven):
-            g = joint_group(names[h])
-            if not base(g):
-                valid = ", ".join(sorted(groups))
-                self.fail(f"[torque.base] has no positive value for {g} (nor a default); driven joints: {valid}")
-            limits[k] = base(g) * (1.0 if scale(g) is None else scale(g))
-        m.actuator_gear[:, 0] = limits
-        return driven, limits
-
-    def passive(self, names, driven):
-        """Spring, damper (a multiple of the spring) and armature of every driven hinge.
-
-        Hinges without a motor (tails, ears) keep what the MJCF gives them."""
-        m = self.model
-        damping = self.number("[passive] damping", self.get("passive", "damping", float), 0)
-        groups = {joint_group(names[h]) for h in driven}
-        stiffness, armature = (self.by_group("passive", key, groups) for key in ("stiffness", "armature"))
-        for h in driven:
-            g = joint_group(names[h])
-            for key, value in (("stiffness", stiffness(g)), ("armature", armature(g))):
-                if value is None:
-                    self.fail(f"[passive.{key}] has no entry for {g}")
-            m.jnt_stiffness[1 + h], m.dof_damping[6 + h] = stiffness(g), damping * stiffness(g)
-            m.dof_armature[6 + h] = armature(g)
-        # MuJoCo scales the softness of contacts and limits by inverse inertias it computed without this armature: again
-        mujoco.mj_setConst(m, mujoco.MjData(m))
-
-    def body_for(self, segment):
-        """The last body of the map that follows a human segment."""
-        found = [b for b, e in self.spec["map"].items() if e["to"] == segment]
-        if not found:
-            self.fail(f"[map] has no body that follows the human's {segment}")
-        return found[-1]
-
-    def chains(self, names):
-        """The joint map in tree order: (body, hinges, axes, from, to, shares)."""
-        m, out = self.model, []
-        mapped = np.zeros(len(names), bool)
-        order = sorted(self.spec["map"], key=lambda b: self.bodies("map", [b])[0])
-        for body in order:
-            entry = self.spec["map"][body]
-            keys = {"from", "to", "x", "y", "z"}
-            if not isinstance(entry, dict) or {"from", "to"} - set(entry) or set(entry) - keys:
-                self.fail(f'[map] {body} must be {{ from = "…", to = "…" }} with optional x, y, z; found {entry!r}')
-            for key in ("from", "to"):
-                if entry[key] not in SEGMENTS:
-                    self.fail(f"[map] {body}.{key} = {entry[key]!r}; valid human segments: {', '.join(SEGMENTS)}")
-            b = int(self.bodies("map", [body])[0])
-            hinges = np.arange(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]) - 1
-            if b == m.jnt_bodyid[0] or not len(hinges):
-                self.fail(f"[map] body {body} has no hinge in {self.xml.name}")
-            axes = "".join("xyz"[np.argmax(np.abs(m.jnt_axis[1 + h]))] for h in hinges)
-            if len(set(axes)) != len(axes):
-                self.fail_xml(f"body {body} has two hinges about one axis ({axes})")
-            shares = {a: self.number(f"[map] {body}.{a}", entry[a]) for a in "xyz" if a in entry}
-            if set(shares) - set(axes):
-                extra = ", ".join(sorted(set(shares) - set(axes)))
-                self.fail(f"[map] {body} shares {extra}, but its hinges turn about {', '.join(axes)}")
-            out.append((b, hinges, axes, SEG[entry["from"]], SEG[entry["to"]], shares))
-            mapped[hinges] = True
-        return out, mapped
-
-    def joint_weights(self, names, mapped):
-        table = self.spec["reward"].get("joints", {})
-        if not isinstance(table, dict):
-            self.fail(f"[reward] joints = {table!r} is not a table of joint = weight")
-        groups = {joint_group(n) for n in names}
-        for g, w in table.items():
-            if g != "default" and g not in groups and g not in names:
-                self.fail(f"[reward.joints] names {g!r}; valid: default, {', '.join(sorted(groups))}, or a joint")
-            self.number(f"[reward.joints] {g}", w, 0)
-        # what has no human motion is not imitated (§3.5.1)
-        w = [table.get(n, table.get(joint_group(n), table.get("default", 1.0))) for n in names]
-        return normalised(np.where(mapped, w, 0.0))
-
-    def rewards(self):
-        """Table 2: term -> (w, k), and "fail"."""
-        valid = (*TERMS, "fail", "joints", "links")
-        for key in self.spec["reward"]:
-            if key not in valid:
-                self.fail(f"[reward] names {key!r}; valid: {', '.join(valid)}")
-        out = {"fail": self.get("reward", "fail", float)}
-        for term in TERMS:
-            pair = self.get("reward", term, list)
-            if len(pair) != 2:
-                self.fail(f"[reward] {term} = {pair!r} must be [w, k], both at least 0")
-            out[term] = tuple(float(self.number(f"[reward] {term} [w, k] {v!r}", v, 0)) for v in pair)
-        return out
-
-
-def joint_group(name: str) -> str:
-    """hip_l_y -> hip, spine0_y -> spine0: the name Table 4 uses, in lower case.
-
-    Test      tests/test_retarget.py::test_character_tables"""
-    return name.split("_")[0]
-
-
-def normalised(w):
-    """Eq. 11's weights made to sum to 1, so that d is a mean.  ASSUMED: the one place where that is decided.
-    With the plain sum over 33 joints and k_q = 25, 0.1 rad everywhere would give e^-8 and no gradient; the mean
-    gives e^-0.25.
-
-    Test      tests/test_retarget.py::test_character_tables"""
-    w = np.asarray(w, dtype=float)
-    return w / w.sum() if w.sum() > 0 else w
-
-
 # ------------------------------------------------------------------------------------ geometry on the model
-
-
-def geom_lowest(model, geoms, xpos, xmat):
-    r"""Height of the lowest point of spheres, capsules and boxes.
-
-    Equation  capsule: z − |a_z| h − r with axis a; box: z − Σ_i |R_zi| s_i
-    Args      geoms : (g,) ids; xpos (N, ngeom, 3); xmat (N, ngeom, 9)
-    Returns   (N, g) [m]
-    Test      tests/test_retarget.py::test_geom_lowest
-    """
-    kind, size = model.geom_type[geoms], model.geom_size[geoms]
-    row = np.abs(xmat[:, geoms, 6:9])  # third row of R: heights of the geom's axes
-    extent = np.where(kind == mujoco.mjtGeom.mjGEOM_SPHERE, size[:, 0], 0.0)
-    extent = extent + np.where(kind == mujoco.mjtGeom.mjGEOM_CAPSULE, size[:, 0] + row[..., 2] * size[:, 1], 0.0)
-    extent = extent + np.where(kind == mujoco.mjtGeom.mjGEOM_BOX, (row * size).sum(-1), 0.0)
-    return xpos[:, geoms, 2] - extent
 
 
 def body_velocity(cvel, xpos, com):
@@ -592,33 +176,51 @@ def retarget(char: Character, clip: Clip) -> Pose:
               the last body of a chain takes the rest, so that chest, head, arms and legs have the human's relative
               rotation exactly (as far as their hinges allow).  Hinges without a counterpart keep the default pose.
               Angles are clipped to the joint ranges.
+    Equation  R_body = Q_segment R_rest: a body has turned from its orientation in the default pose (`Character.rest`)
+              as the human's segment has from upright.  ASSUMED: the default pose is the human's, standing with
+              hanging arms (for a bent-over Dino: §5.2's style by retargeting)
     Frame     qpos: world, quaternion w, x, y, z; qvel: root linear velocity in the world's frame, root angular
               velocity in the root's, as MuJoCo has them
-    Test      tests/test_retarget.py::test_retarget_reproduces_segments
+    Test      tests/test_retarget.py::test_retarget_reproduces_segments, ::test_rest_offset
     """
-    n = len(clip)
+    n, m = len(clip), char.model
     q = np.tile(char.default, (n, 1))
-    chains = {}  # (from, to) -> what the chain's bodies have turned so far
-    for _, hinges, axes, a, b, shares in char.chains:
+    chains = {}  # (from, to) -> what the chain's bodies have turned so far, from the default pose
+    for body, hinges, axes, a, b, shares in char.chains:
         turn = quat_mul(quat_conj(clip.quat[:, a]), clip.quat[:, b])
         done = chains.get((a, b), np.tile([1.0, 0, 0, 0], (n, 1)))
+        local = quat_mul(char.rest[m.body_parentid[body]], m.body_quat[body])  # the body, were its hinges at 0
+        sign = m.jnt_axis[1 + hinges][np.arange(len(hinges)), ["xyz".index(x) for x in axes]]
         if shares:
             full = dict(zip("yxz", euler_angles(turn, "yxz").T, strict=True))
             angles = np.stack([shares.get(axis, 0.0) * full[axis] for axis in axes], axis=1)
+            angles += sign * char.default[hinges]
         else:
-            angles = euler_angles(quat_mul(quat_conj(done), turn), axes)
+            wanted = quat_mul(quat_mul(quat_conj(done), turn), char.rest[body])
+            angles = euler_angles(quat_mul(quat_conj(local), wanted), axes)
         for k, axis in enumerate(axes):
-            done = quat_mul(done, mocap.quat_about("xyz".index(axis), angles[:, k]))
-        chains[a, b] = done
-        sign = char.model.jnt_axis[1 + hinges][np.arange(len(hinges)), ["xyz".index(x) for x in axes]]
-        q[:, hinges] += angles * sign
+            local = quat_mul(local, mocap.quat_about("xyz".index(axis), angles[:, k]))
+        chains[a, b] = quat_mul(done, quat_mul(local, quat_conj(char.rest[body])))
+        q[:, hinges] = angles * sign
     inside = np.clip(q, char.ranges[:, 0], char.ranges[:, 1])
     root_pos = clip.pos[:, 0] * root_scale(char, clip)
-    root_quat = quat_continuous(clip.quat[:, 0])
+    root_quat = quat_continuous(quat_mul(clip.quat[:, 0], char.rest[char.root]))
     qpos = np.concatenate([root_pos, root_quat, inside], axis=1)
     spin = quat_rotate(quat_conj(root_quat), angular_velocity(root_quat, clip.rate))
     qvel = np.concatenate([linear_velocity(root_pos, clip.rate), spin, linear_velocity(inside, clip.rate)], axis=1)
     return Pose(qpos, qvel, np.abs(inside - q) > 1e-9)
+
+
+def rest_offset(char: Character, quat):
+    r"""What the human's root and head demand of the character's  [Reda23 §3.5.1, App. A].
+
+    Equation  q_gt = q_human q_rest, q_rest the orientation of root and head in the character's default pose
+    ASSUMED   the paper has no offset; without one a head that rests level on a bent-over spine would be pulled down
+    Args      quat (T, 2, 4) of the human's pelvis and head, world
+    Returns   (T, 2, 4)
+    Test      tests/test_retarget.py::test_rest_offset
+    """
+    return quat_mul(quat, char.rest[[char.root, char.head]])
 
 
 @dataclass
@@ -638,7 +240,7 @@ class Reference:
     qvel: np.ndarray  # (F, nv) float64
     link_pos: np.ndarray  # (F, l, 3) float32, reward links
     link_vel: np.ndarray  # (F, l, 3) float32
-    orientation: np.ndarray  # (F, 2, 4) float64, human root and head
+    orientation: np.ndarray  # (F, 2, 4) float64, human root and head, times the character's rest (`rest_offset`)
     contact: np.ndarray  # (F, 2) bool, human feet
     sensor_pos: np.ndarray  # (F, 3, 3) float64
     sensor_rot: np.ndarray  # (F, 3, 3, 2) float32
@@ -663,7 +265,8 @@ def reference(char: Character, clips: list[Clip]) -> Reference:
     rows = [_reference_of(char, c) for c in clips]
     lengths = np.array([len(c) for c in clips])
     first = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    joined = {k: np.concatenate([r[k] for r in rows]) for k in rows[0]}
+    # a frame's numbers side by side in memory, because the environment gathers frames
+    joined = {k: np.ascontiguousarray(np.concatenate([r[k] for r in rows])) for k in rows[0]}
     return Reference([c.name for c in clips], rates.pop(), first, first + lengths - 1, **joined)
 
 
@@ -678,7 +281,7 @@ def _reference_of(char, clip):
         qvel=pose.qvel,
         link_pos=fk.xpos[:, char.reward_links].astype(f32),
         link_vel=fk.velocity[:, char.reward_links].astype(f32),
-        orientation=clip.quat[:, [SEG["pelvis"], SEG["head"]]],
+        orientation=rest_offset(char, clip.quat[:, [SEG["pelvis"], SEG["head"]]]),
         contact=mocap.contacts(clip),
         sensor_pos=sensor_pos * scale,
         sensor_rot=quat_matrix(sensor_quat)[..., :2].astype(f32),
@@ -773,47 +376,66 @@ def write_bvh(path, char: Character, qpos, rate) -> None:
 
 
 @dataclass
-class Options:
+class Options(character.Switches):
     """What `python retarget.py` can be told."""
 
-    character: str = arg("jesse", "name in characters/, or path of a .toml")
+    check: str | None = arg(None, "name every part that a character lacks: path of its .xml or .toml")
     motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names")
     joint_map: str | None = arg(None, HELP["joint_map"])
     unit: str | None = arg(None, HELP["unit"])
     up: str | None = arg(None, HELP["up"])
     png: str | None = arg(None, "write a contact sheet of the first clip, human and character side by side")
+    camera: str = arg("track", "camera of the pictures: track, side, front, or another of the model's")
     video: str | None = arg(None, "write a video of the first clip (.mp4; needs the extra `view`)")
     bvh: str | None = arg(None, "write the character's kinematic pose in the first clip as BVH")
 
 
-def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360)):
-    """Images with the human (stick figure) and the character side by side, 1 m apart.  -> list of (H, W, 3) uint8
+def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360), camera="track"):
+    """Images with the human (stick figure) at the left of the character.  -> list of (H, W, 3) uint8
 
     Test      tests/test_retarget.py::test_draw"""
     import render
 
-    shown = character(char.path, visual=True)
-    scene = render.Scene(shown.model, *size)
-    data = mujoco.MjData(shown.model)
+    shown = char.mjspec().compile()
+    scene, apart = render.Scene(shown, *size, camera=camera), 0.2 + 0.9 * char.hip_height  # m
+    data = mujoco.MjData(shown)
     images = []
     for t in frames:
         data.qpos[:] = pose.qpos[t]
-        mujoco.mj_forward(shown.model, data)
+        mujoco.mj_forward(shown, data)
         left = quat_rotate(clip.quat[t, 0], np.array([0.0, 1.0, 0.0])) * [1, 1, 0]
-        side = left / max(np.linalg.norm(left), 1e-9)
+        side = apart * left / max(np.linalg.norm(left), 1e-9)
         points = np.concatenate([clip.pos[t], clip.ball[t]]) + side
         bones = list(mocap.PARENTS) + list(mocap.FEET)
         images.append(scene.frame(data, markers=render.stick_figure(points, bones)))
     return images
 
 
-def main(argv=None):
-    """Print the artefacts of every clip's kinematic pose; draw the first one.
+def report(name) -> int:
+    """Print all that is wrong with a character, or else its joints and masses.  -> exit status, 1 if anything is
 
-    Test      tests/test_retarget.py::test_command_line"""
+    Test      tests/test_characters.py::test_check_command"""
+    problems = character.check(name)
+    for problem in problems:
+        print(problem)
+    if problems:
+        print(f"{len(problems)} to mend")
+        return 1
+    path = Path(name)
+    char = character.load(path.with_suffix(".toml") if path.suffix == ".xml" else name)
+    print(char.summary())
+    return 0
+
+
+def main(argv=None):
+    """Print the artefacts of every clip's kinematic pose; draw the first one.  Or check a character.
+
+    Test      tests/test_retarget.py::test_command_line, tests/test_characters.py::test_check_command"""
     opt = cli(Options, argv, "retarget.py", __doc__)
-    char = character(opt.character)
+    if opt.check:
+        return report(opt.check)
+    char = opt.load()
     clips = mocap.load(opt.motion, clips=opt.clips, reading=Reading.of(opt))
     print(
         f"{char.name}: hips {char.hip_height:.3f} m, {char.j} hinges, {len(char.limits)} driven, "
@@ -848,10 +470,11 @@ def main(argv=None):
         if opt.png:
             frames = np.linspace(0, len(clip) - 1, 12).astype(int)
             labels = [f"{t / clip.rate:.1f} s" for t in frames]
-            render.write_png(opt.png, render.contact_sheet(draw(char, clip, pose, frames), labels, 4))
+            images = draw(char, clip, pose, frames, camera=opt.camera)
+            render.write_png(opt.png, render.contact_sheet(images, labels, 4))
             print(opt.png)
         if opt.video:
-            render.write_video(opt.video, draw(char, clip, pose, range(len(clip))), clip.rate)
+            render.write_video(opt.video, draw(char, clip, pose, range(len(clip)), camera=opt.camera), clip.rate)
             print(opt.video)
 
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import re
 import sys
-import tomllib
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -42,7 +41,7 @@ from human import (
     quat_mul,
     quat_rotate,
 )
-from runs import UserError
+from runs import UserError, printable, read_toml
 
 # ------------------------------------------------------------------------------------ known rigs
 
@@ -78,14 +77,15 @@ def _axis(a):
         v = np.zeros(3)
         v["xyz".index(a[-1])] = -1.0 if a[0] == "-" else 1.0
         return v
+    if not np.linalg.norm(a) > 1e-9:
+        raise ValueError("joints lie on one another, or an axis along its bone")
     return np.asarray(a, dtype=float) / np.linalg.norm(a)
 
 
 def _frame(left, up):
-    """(forward, left, up) from a left axis made orthogonal to up."""
+    """(forward, left, up) from a left axis made orthogonal to up.  ValueError: there is no such axis"""
     left, up = _axis(left), _axis(up)
-    left = left - up * (left @ up)
-    left /= np.linalg.norm(left)
+    left = _axis(left - up * (left @ up))
     return np.cross(left, up), left, up
 
 
@@ -188,14 +188,15 @@ HELP = {  # of the flags that every command with --motion has
 
 def _unit(where, value) -> float | None:
     """Metres a unit."""
-    if value is None or value in UNITS:
+    if value is None or isinstance(value, str) and value in UNITS:
         return UNITS.get(value)
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = np.nan
-    if isinstance(value, bool) or not 0.0 < number < np.inf:
-        raise UserError(f"{where} {value!r} is no unit; valid: {', '.join(UNITS)}, or metres a unit as a number")
+    if isinstance(value, bool) or not 1e-6 <= number <= 1e6:
+        valid = f"{', '.join(UNITS)}, or metres a unit as a number, 1e-6 to 1e6"
+        raise UserError(f"{where} {value!r} is no unit; valid: {valid}")
     return number
 
 
@@ -283,11 +284,19 @@ def _skeleton(b):
 def read(path) -> bvh.Bvh:
     """A BVH file as it stands; UserError if there is none.  Test: tests/test_cli.py::test_broken_motion."""
     try:
-        return bvh.read(path)
+        b = bvh.read(path)
     except bvh.BvhError as e:
         raise UserError(str(e)) from None
     except OSError as e:
         raise UserError(f"{path}: {e.strerror or e}; expected a .bvh file") from None
+    _check_moving(path, len(b.names), b.values.shape[1])
+    return b
+
+
+def _check_moving(path, joints, values):
+    """A pose of all joints takes no more memory than its row of values is worth."""
+    if joints > 2 * values:
+        raise UserError(f"{path}: {joints} joints of which most cannot move, {values} values a frame; expected a rig")
 
 
 def _read_or_none(path):
@@ -330,7 +339,18 @@ def canonical(b: bvh.Bvh, rig: Rig, name: str) -> Clip:
         print(f"{b.path}: the balls of the feet stand at {low:.2f} m: moved to the floor", file=sys.stderr)
         down = np.array([0.0, 0.0, low - BALL_HEIGHT])
         pose = replace(pose, pos=pose.pos - down, ball=pose.ball - down)
+    _check_size(b.path, pose)
     return replace(pose, body=_body(name, pose))
+
+
+HIP_HEIGHTS = (0.1, 10.0)  # m; what follows divides by the height of the hips
+
+
+def _check_size(path, clip):
+    """UserError if nobody is that small or that large."""
+    if not HIP_HEIGHTS[0] <= clip.hip_height <= HIP_HEIGHTS[1]:
+        valid = f"{HIP_HEIGHTS[0]:g} to {HIP_HEIGHTS[1]:g} m; a BVH file's unit and axis can be given as --unit, --up"
+        raise UserError(f"{path}: the hips are {clip.hip_height:.3g} m above the floor; valid: {valid}")
 
 
 def _body(rig: str, clip: Clip) -> str:
@@ -347,7 +367,8 @@ def _lowest(clip):
 def _pose(b, root_offset="replace"):
     """Names, positions and rotations of joints and, as JOINT.end, of End Sites.  File units and axes."""
     pos, quat = bvh.global_pose(b, root_offset)
-    at = [b.names.index(n) for n in b.end_sites]
+    index = {n: j for j, n in enumerate(b.names)}
+    at = [index[n] for n in b.end_sites]
     ends = pos[:, at] + quat_rotate(quat[:, at], np.array(list(b.end_sites.values())).reshape(-1, 3))
     names = (*b.names, *(f"{n}.end" for n in b.end_sites))
     return names, np.concatenate([pos, ends], axis=1), np.concatenate([quat, quat[:, at]], axis=1)
@@ -433,10 +454,17 @@ def guess(b: bvh.Bvh, joints=None, balls=None):
     """
     joints = dict(joints or {})
     named = [read_name(n) for n in b.names]
-    above = {-1: set()}
-    for j, p in enumerate(b.parents):
-        above[j] = above[p] | {j}
-    index = {n: j for j, n in enumerate(b.names)} | {f"{n}.end": b.names.index(n) for n in b.end_sites}
+    index = {n: j for j, n in enumerate(b.names)}
+    index |= {f"{n}.end": index[n] for n in b.end_sites}
+
+    def above(j):
+        """Joint j and all that it hangs from."""
+        found = set()
+        while j >= 0:
+            found.add(int(j))
+            j = b.parents[j]
+        return found
+
     for side, ball in zip("lr", balls or (None, None)):
         if ball:
             joints[f"ball_{side}"] = ball
@@ -448,12 +476,12 @@ def guess(b: bvh.Bvh, joints=None, balls=None):
                     j
                     for word in _WORDS[part]
                     for j, name in enumerate(named)
-                    if name == (side, word) and top < above[j] and b.names[j] not in joints.values()
+                    if name == (side, word) and b.names[j] not in joints.values() and top < above(j)
                 ]
                 if key not in joints and fits:
                     joints[key] = b.names[fits[0]]
                 if key in joints:
-                    top = above[index[joints[key]]]
+                    top = above(index[joints[key]])
         foot = joints.get(f"foot_{side}")
         if foot and f"ball_{side}" not in joints:  # toes of another name: the foot's only child, or where it ends
             children = [n for n, p in zip(b.names, b.parents) if b.names[p] == foot and p >= 0]
@@ -464,11 +492,11 @@ def guess(b: bvh.Bvh, joints=None, balls=None):
     for part, limb in (("pelvis", "thigh"), ("chest", "upper_arm")):
         pair = [joints.get(f"{limb}_{side}") for side in "lr"]
         if part not in joints and all(pair):
-            meet = set.intersection(*(above[index[n]] - {index[n]} for n in pair))
+            meet = set.intersection(*(above(index[n]) - {index[n]} for n in pair))
             if meet and b.names[max(meet)] not in joints.values():
                 joints[part] = b.names[max(meet)]
-    trunk = above[index[joints["chest"]]] if "chest" in joints else set()
-    heads = [j for j, (side, word) in enumerate(named) if not side and word.endswith("head") and trunk < above[j]]
+    trunk = above(index[joints["chest"]]) if "chest" in joints else set()
+    heads = [j for j, (side, word) in enumerate(named) if not side and word.endswith("head") and trunk < above(j)]
     if "head" not in joints and heads:
         joints["head"] = b.names[min(heads, key=lambda j: named[j][1] != "head")]
     balls = tuple(joints.pop(f"ball_{side}", None) for side in "lr")
@@ -482,12 +510,7 @@ def read_map(path):
     Raises    UserError: the file, the key, and what would be valid
     Test      tests/test_rigs.py::test_bad_joint_maps
     """
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as e:
-        raise UserError(f"{path}: {e.strerror or e}; expected a joint map (TOML)") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-        raise UserError(f"{path}: no TOML: {e}") from None
+    table = read_toml(path, "a joint map (TOML)")
     for key in table:
         if key not in ("joints", "unit", "up", "balls"):
             raise UserError(f"{path}: unknown key {key!r}; valid: unit, up, balls, [joints]")
@@ -512,17 +535,10 @@ def blank_map(b: bvh.Bvh, joints, balls, missing) -> str:
     """A joint map to fill in: what was guessed, and a gap for what was not.  Test: test_rigs.py::test_unknown_rig."""
     quote = lambda name: '"' + (name or "").replace("\\", "\\\\").replace('"', '\\"') + '"'  # noqa: E731
     lines = [f"# joint map of {b.path}; its joints, and with .end their End Sites:"]
-    lines += [f"#   {'  ' * depth}{name}" for name, depth in zip(b.names, _depths(b))]
+    lines += [f"#   {printable(line)}" for line in bvh.outline(b.names, b.parents)]
     lines += [f"balls = [{quote(balls[0])}, {quote(balls[1])}]  # of the feet, left and right", "", "[joints]"]
     lines += [f"{s} = {quote(joints.get(s))}" + ("  # ?" if s in missing else "") for s in SEGMENTS]
     return "\n".join(lines)
-
-
-def _depths(b):
-    depth = []
-    for parent in b.parents:
-        depth.append(depth[parent] + 1 if parent >= 0 else 0)
-    return depth
 
 
 def _check_map(source, b, joints, balls):
@@ -531,12 +547,13 @@ def _check_map(source, b, joints, balls):
     used = {}
     for key, name in [*joints.items(), *((f"ball_{s}", n) for s, n in zip("lr", balls) if n)]:
         if name not in valid:
-            raise UserError(f"{source}: {key} = {name!r} is no joint of {b.path}; valid: {', '.join(b.names)}")
+            raise UserError(f"{source}: {key} = {name!r} is no joint of {b.path}; valid: {bvh.listed(b.names)}")
         if name in used:
             raise UserError(f"{source}: {key} and {used[name]} are both {name!r}; expected joints of their own")
         used[name] = key
     for segment, parent in zip(SEGMENTS[3:], PARENTS[3:]):
-        low, high = (joints.get(s, "").removesuffix(".end") for s in (segment, SEGMENTS[parent]))
+        low, high = (joints.get(s, "") for s in (segment, SEGMENTS[parent]))
+        low, high = (n if n in b.names else n.removesuffix(".end") for n in (low, high))
         if parent > 1 and low and high:
             j = b.names.index(low)
             while j >= 0 and b.names[j] != high:
@@ -559,7 +576,8 @@ def _unknown(group, reading):
     if missing:
         print(blank_map(b, joints, balls, missing))
         raise UserError(
-            f"{b.path}: unknown skeleton, and no guess for {', '.join(missing)} among its joints {', '.join(b.names)}; "
+            f"{b.path}: unknown skeleton, and no guess for {', '.join(missing)} "
+            f"among its joints {bvh.listed(b.names)}; "
             f"known: {', '.join((*RIGS, 'cmu'))}; fill in the joint map printed above and give it as --joint-map FILE"
         )
     pairs = [
@@ -588,7 +606,10 @@ def _unknown(group, reading):
     human = [
         _human(rig, np.tile([1.0, 0, 0, 0], (15, 1)), *p, "", "", 1.0 / e.frame_time) for p, e in zip(poses, group)
     ]
-    axes, notes = measure(b.path, human, [_fingers(b, rig, p) for p in poses])
+    try:
+        axes, notes = measure(b.path, human, [_fingers(b, rig, p) for p in poses])
+    except ValueError as e:
+        raise UserError(f"{b.path}: the axes of its segments cannot be measured: {e}; expected a human") from None
     for note in notes:
         say(note)
     return replace(rig, axes=axes), Path(reading.joint_map).stem if reading.joint_map else "guessed"
@@ -773,7 +794,7 @@ def cmu_rig(skeleton: amc.Skeleton) -> Rig:
     if missing:
         raise UserError(
             f"{skeleton.path}: no CMU skeleton: {', '.join(missing)} missing or without rx; "
-            f"it has {', '.join(skeleton.names)}"
+            f"it has {bvh.listed(skeleton.names)}"
         )
 
     def hinge(name):
@@ -803,10 +824,14 @@ def from_amc(path, rate=AMC_RATE) -> Clip:
     Test      tests/test_amc.py::test_from_amc_against_matrices, ::test_skeleton_beside, ::test_cmu_anatomy
     """
     s, motion = read_amc(path)
-    rig = cmu_rig(s)
+    try:
+        rig = cmu_rig(s)
+    except ValueError as e:
+        raise UserError(f"{s.path}: the axes of its bones make no frame: {e}; expected CMU's bones") from None
     calibrations = np.stack([rig.calibration(segment) for segment in SEGMENTS])
     pose = amc.global_pose(s, motion)
     clip = level(_human(rig, calibrations, s.names, *pose, Path(path).stem, "", float(rate)))
+    _check_size(path, clip)
     return replace(clip, body=_body(f"cmu-{Path(s.path).stem}", clip))
 
 
@@ -855,8 +880,10 @@ def read_amc(path):
                 f"there is {found}"
             )
         s = amc.read_asf(skeleton[0]) if skeleton else None
-        return s, amc.read_amc(path, s)
+        motion = amc.read_amc(path, s)
+        _check_moving(s.path, len(s.names), len(s.columns))
+        return s, motion
     except amc.AmcError as e:
         raise UserError(str(e)) from None
     except OSError as e:
-        raise UserError(f"{path}: {e.strerror or e}; expected an .amc file") from None
+        raise UserError(f"{e.filename or path}: {e.strerror or e}; expected a file") from None

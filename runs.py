@@ -19,11 +19,14 @@ import difflib
 import fnmatch
 import io
 import json
+import math
 import os
 import platform
+import struct
 import subprocess
 import sys
 import time
+import tomllib
 import types
 import typing
 import zipfile
@@ -36,8 +39,26 @@ import numpy as np
 CHECKPOINT, PREVIOUS, CONFIG, METRICS = "checkpoint.npz", "checkpoint.prev.npz", "config.json", "metrics.csv"
 
 
+MESSAGE = 4000  # characters of the longest message; more is cut out of its middle
+
+
 class UserError(Exception):
-    """Bad input from outside. The message names the file, flag or value, and what would have been valid."""
+    """Bad input from outside. The message names the file, flag or value, and what would have been valid.
+
+    It is one line, and printable: what a damaged file holds reaches the terminal as text.
+    Test      tests/test_runs.py::test_user_error_is_one_line
+    """
+
+    def __init__(self, message):
+        text = printable(" ".join(str(message).split()))
+        if len(text) > MESSAGE:
+            text = f"{text[: MESSAGE * 3 // 4]} … {text[-MESSAGE // 4 + 3 :]}"
+        super().__init__(text)
+
+
+def printable(text) -> str:
+    """Text with control characters and the like escaped.  Test: tests/test_runs.py::test_user_error_is_one_line"""
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def run_main(main_fn, argv=None):
@@ -45,7 +66,7 @@ def run_main(main_fn, argv=None):
     try:
         code = main_fn(sys.argv[1:] if argv is None else argv)
     except UserError as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -204,6 +225,114 @@ def atomic_write(path, content, previous=None):
         raise UserError(f"cannot write {path}: {reason}; give a folder that exists and is writable") from None
 
 
+# ---- files from outside ---------------------------------------------------------------------------------------------
+
+TOML_BYTES, TOML_LINE = 65536, 1000  # tomllib's time and memory grow with the square of the dots in a key
+NESTING = 16  # tables and arrays inside one another: no file of ours has more than 4
+INTEGER = 60  # digits; a generator's state has 39
+
+
+def read_text(path, expected, limit=None) -> str:
+    """A whole text file.
+
+    Args      path : file, UTF-8 with or without a byte order mark; expected : what it should be, for the message
+              limit : bytes, or None
+    Raises    UserError: cannot be opened, longer than the limit, or another encoding
+    Test      tests/test_runs.py::test_read_text
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read(-1 if limit is None else limit + 1)
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"cannot read {path}: {getattr(error, 'strerror', None) or error}; expected {expected}"
+        ) from None
+    if limit is not None and len(data) > limit:
+        raise UserError(f"{path}: longer than {limit} bytes; expected {expected}")
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise UserError(f"{path}: UTF-16 text; expected {expected}, in UTF-8 (save it again in that encoding)")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise UserError(
+            f"{path}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8; expected {expected}"
+        ) from None
+
+
+def read_toml(path, expected) -> dict:
+    """The tables of a TOML file; time and memory follow its size.
+
+    Args      path : file; expected : what it should be, for the message
+    Raises    UserError: cannot be opened, no TOML (with line and column), or nested too deep
+    Test      tests/test_runs.py::test_read_toml, tests/test_fuzz.py::test_joint_maps
+    """
+    text = read_text(path, expected, TOML_BYTES)
+    for number, line in enumerate(text.split("\n"), 1):
+        if len(line) > TOML_LINE:
+            raise UserError(f"{path}, line {number}: longer than {TOML_LINE} characters; expected {expected}")
+    try:
+        table = tomllib.loads(text)
+        _check_nesting(table)
+    except RecursionError:
+        raise UserError(f"{path}: nested more than {NESTING} deep; expected {expected}") from None
+    except ValueError as error:
+        raise UserError(f"{path}: no TOML: {error}; expected {expected}") from None
+    return table
+
+
+def parse_json(text):
+    """JSON without what it does not have: NaN, infinity, a key twice; nor numbers or nesting beyond any use.
+
+    Raises    ValueError: what it is and, where known, where
+    Test      tests/test_runs.py::test_parse_json, tests/test_fuzz.py::test_run_folders
+    """
+
+    def pairs(items):
+        table = dict(items)
+        if len(table) < len(items):
+            raise ValueError(f"key {_twice(name for name, _ in items)[:40]!r} is there twice; valid: once")
+        return table
+
+    def finite(word):
+        if not np.isfinite(float(word)):
+            raise ValueError(f"{word[:40]} is no finite number")
+        return float(word)
+
+    def integer(word):
+        if len(word) > INTEGER:
+            raise ValueError(f"an integer of {len(word)} digits; valid: at most {INTEGER}")
+        return int(word)
+
+    try:
+        value = json.loads(text, object_pairs_hook=pairs, parse_float=finite, parse_int=integer, parse_constant=finite)
+        _check_nesting(value)
+    except RecursionError:
+        raise ValueError(f"nested more than {NESTING} deep") from None
+    return value
+
+
+def _check_nesting(tree):
+    """RecursionError if dicts and lists lie more than NESTING deep in one another."""
+    level = [tree]
+    for _ in range(NESTING):
+        level = [v for each in level if isinstance(each, dict | list) for v in _values(each)]
+        if not level:
+            return
+    if any(isinstance(v, dict | list) for v in level):
+        raise RecursionError
+
+
+def _twice(names):
+    """The first of the names that is there again."""
+    seen = set()
+    return next(name for name in names if name in seen or seen.add(name))
+
+
+def _values(tree):
+    return tree.values() if isinstance(tree, dict) else tree
+
+
 # ---- run folder -----------------------------------------------------------------------------------------------------
 
 
@@ -235,8 +364,9 @@ def git_state(folder=None):
 def check_run(out, resume=False):
     """Is a run there where one is to be resumed, and none where one is to start?  Call it before slow work.
 
-    Raises    UserError: a run is there already and resume is False; or none is there and resume is True
-    Test      tests/test_runs.py::test_open_run
+    Raises    UserError: a run is there already and resume is False; or none is there and resume is True, or its
+              metrics.csv cannot be continued
+    Test      tests/test_runs.py::test_open_run, tests/test_fuzz.py::test_run_folders
     """
     out = Path(out)
     there = any((out / name).exists() for name in (CONFIG, CHECKPOINT, PREVIOUS, METRICS))
@@ -244,6 +374,8 @@ def check_run(out, resume=False):
         raise UserError(f"{out} already holds a run: add --resume to continue it, or choose another folder")
     if resume and not there:
         raise UserError(f"{out} holds no run to resume: leave out --resume, or name a folder that has {CONFIG}")
+    if resume and (out / METRICS).exists():
+        _whole_lines(out / METRICS)
 
 
 def open_run(out, config, resume=False):
@@ -275,15 +407,58 @@ def open_run(out, config, resume=False):
 
 
 def read_config(folder):
-    """The record in folder/config.json: {"config", "versions", "git", "earlier"}; UserError if it is unreadable."""
+    """The record in folder/config.json: {"config", "versions", "git", "earlier"}; UserError if it is unreadable.
+
+    Test      tests/test_runs.py::test_open_run, tests/test_fuzz.py::test_run_folders"""
     path = Path(folder) / CONFIG
+    expected = f"the {CONFIG} that the run wrote"
     try:
-        record = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read {path} ({error}): a run folder has the {CONFIG} that the run wrote") from None
+        record = parse_json(read_text(path, expected))
+    except ValueError as error:
+        raise UserError(f"cannot read {path} ({error}); expected {expected}") from None
     if not isinstance(record, dict) or not isinstance(record.get("config"), dict):
-        raise UserError(f'{path} has no "config" table: a run folder has the {CONFIG} that the run wrote')
+        raise UserError(f'{path} has no "config" table; expected {expected}')
+    if not isinstance(record.get("earlier", []), list):
+        raise UserError(f'{path}: "earlier" is no list; expected {expected}')
     return record
+
+
+def stored_options(dataclass_type, folder) -> dict:
+    """What config.json says of the fields of dataclass_type, each of its field's kind and in its range.
+
+    Args      dataclass_type : class whose fields are declared with `arg`; folder : of a run
+    Returns   field -> value, without fields that the file does not have
+    Raises    UserError: the file, the field, and what would be valid
+    Test      tests/test_runs.py::test_stored_options, tests/test_fuzz.py::test_run_folders
+    """
+    config, hints, values = read_config(folder)["config"], typing.get_type_hints(dataclass_type), {}
+    for f in dataclasses.fields(dataclass_type):
+        if f.name not in config:
+            continue
+        value, hint = config[f.name], hints[f.name]
+        check, choices = f.metadata.get("check"), f.metadata.get("choices")
+        if not _fits(hint, value):
+            valid = hint.__name__ if isinstance(hint, type) else str(hint)
+        elif value is not None and check and not check[0](value):
+            valid = check[1]
+        elif value is not None and choices and value not in choices:
+            valid = " or ".join(map(str, choices))
+        else:
+            values[f.name] = tuple(value) if isinstance(value, list) else value
+            continue
+        raise UserError(f"{Path(folder) / CONFIG}: {f.name} = {str(value)[:200]} is not valid; it must be {valid}")
+    return values
+
+
+def _fits(hint, value):
+    """Has a value from JSON the kind that a field's annotation asks for?"""
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        return any(_fits(each, value) for each in typing.get_args(hint))
+    if typing.get_origin(hint) in (tuple, list):
+        return isinstance(value, list) and all(_fits(typing.get_args(hint)[0], v) for v in value)
+    if hint in (int, float):
+        return isinstance(value, (int, hint)) and not isinstance(value, bool) and abs(value) < 2**63
+    return isinstance(value, str if hint is Path else hint)
 
 
 def _plain(value):
@@ -297,7 +472,9 @@ def _plain(value):
 
 # ---- checkpoints ----------------------------------------------------------------------------------------------------
 
-UNREADABLE = (OSError, EOFError, ValueError, KeyError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
+UNREADABLE = (
+    OSError, EOFError, ValueError, KeyError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error, struct.error
+)  # fmt: skip
 
 
 def save_checkpoint(path, arrays, meta):
@@ -331,13 +508,12 @@ def load_checkpoint(path, finite=()):
     Raises    UserError: missing, cut short, not a checkpoint, object arrays, or non-finite numbers
     Test      tests/test_runs.py::test_checkpoint_round_trip, test_damaged_checkpoints
     """
-    expected = f"a checkpoint is an .npz file that save_checkpoint wrote (such as {CHECKPOINT} in a run folder)"
+    expected = f"expected an .npz file that save_checkpoint wrote (such as {CHECKPOINT} in a run folder)"
     if not Path(path).is_file():
         raise UserError(f"no checkpoint {path}: {expected}")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        meta = json.loads(arrays.pop("__meta__").tobytes())
+        arrays = _read_arrays(path)
+        meta = parse_json(arrays.pop("__meta__").tobytes())
     except (*UNREADABLE, AttributeError, TypeError) as error:
         detail = "no __meta__ entry" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
         raise UserError(f"cannot read checkpoint {path} ({detail}): {expected}") from None
@@ -346,11 +522,39 @@ def load_checkpoint(path, finite=()):
     for pattern in finite:
         names = fnmatch.filter(arrays, pattern)
         if not names:
-            raise UserError(f"checkpoint {path} has no array {pattern!r}; it has: {', '.join(sorted(arrays))}")
+            there = ", ".join(name[:40] for name in sorted(arrays)[:50])
+            raise UserError(f"checkpoint {path} has no array {pattern!r}; it has: {there}; needed: {', '.join(finite)}")
         for name in names:
             if arrays[name].dtype.kind in "fc" and not np.isfinite(arrays[name]).all():
-                raise UserError(f"checkpoint {path}: array {name!r} holds NaN or infinity; use an earlier checkpoint")
+                raise UserError(f"checkpoint {path}: array {name!r} holds NaN or infinity; give an earlier checkpoint")
     return arrays, meta
+
+
+def _read_arrays(path):
+    """The arrays of an .npz.  Its members must be stored as they are, so that none is larger than the file.
+
+    NumPy's own reader makes room for whatever a header or a compressed member claims, before it looks."""
+    arrays = {}
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        claimed, size = sum(m.file_size for m in members), os.path.getsize(path)
+        if claimed > size or any(m.compress_type != zipfile.ZIP_STORED for m in members):
+            raise ValueError(f"its members claim {claimed} bytes of a file of {size}, or are compressed")
+        for member in members:
+            name = member.filename.removesuffix(".npy")
+            if name in arrays:
+                raise ValueError(f"array {name!r} is there twice")
+            with archive.open(member) as file:
+                version = np.lib.format.read_magic(file)
+                read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+                shape, fortran, dtype = read_header[version](file)
+                data = file.read()
+            if dtype.kind not in "biufcUS" or not dtype.itemsize:
+                raise ValueError(f"array {name!r} is of {dtype}, not of numbers or text")
+            if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data):
+                raise ValueError(f"array {name!r} claims the shape {shape} of {dtype} and has {len(data)} bytes")
+            arrays[name] = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C").copy(order="K")
+    return arrays
 
 
 def latest_checkpoint(folder, finite=()):
@@ -425,24 +629,27 @@ class Metrics:
     """
 
     def __init__(self, path, resume_row=None):
-        self.path, self.header, self.rows = Path(path), None, 0
+        self.path, self.header, self.rows, self.found = Path(path), None, 0, False
         lines = []
         if resume_row is not None and self.path.exists():
             lines = _whole_lines(self.path)[: resume_row + 1]
             self.header, self.rows = (lines[0] if lines else None), max(len(lines) - 1, 0)
+            self.found = bool(lines)
             if self.rows < resume_row:
                 print(f"note: {path} has {self.rows} of the checkpoint's {resume_row} rows", file=sys.stderr)
         atomic_write(self.path, "".join(_csv(line) for line in lines))
         self.file = open(self.path, "a", newline="")
 
     def append(self, row):
-        """Add one row, a dict of name -> number; every row has the same names. ValueError otherwise."""
+        """Add one row, a dict of name -> number; every row has the same names.  ValueError otherwise, or UserError if
+        the header is the file's"""
         if self.header is None:
             self.header = list(row)
             self.file.write(_csv(self.header))
         if list(row) != self.header:
             odd = sorted(set(row) ^ set(self.header)) or "the order of the names"
-            raise ValueError(f"{self.path}: the row differs from the header in {odd}; valid: {self.header}")
+            kind = UserError if self.found else ValueError
+            raise kind(f"{self.path}: the row differs from the header in {odd}; valid: {', '.join(self.header)}")
         self.file.write(_csv([_plain(v) if isinstance(v, np.ndarray | np.generic) else v for v in row.values()]))
         self.file.flush()
         self.rows += 1
@@ -454,31 +661,43 @@ class Metrics:
 def read_metrics(path):
     """metrics.csv as name -> (rows,) float64; an unfinished last line is left out, an empty cell is NaN.
 
-    Raises    UserError: no such file, or a cell that is no number
-    Test      tests/test_runs.py::test_metrics_resume
+    A run writes `nan` and `inf` where that is what it found: they are read as such.
+    Raises    UserError: no such file, a column twice, or a cell that is no number
+    Test      tests/test_runs.py::test_metrics_resume, test_bad_metrics, tests/test_fuzz.py::test_run_folders
     """
     lines = _whole_lines(path)
     header, rows = (lines[0], lines[1:]) if lines else ([], [])
     columns = {name: np.empty(len(rows)) for name in header}
+    if len(columns) < len(header):
+        raise UserError(f"{path} line 1: column {_twice(header)[:40]!r} is there twice; valid: once each")
     for i, row in enumerate(rows):
         for name, cell in zip(header, row, strict=True):
             try:
-                columns[name][i] = float(cell) if cell else np.nan
+                columns[name][i] = parse_number(cell) if cell else np.nan
             except ValueError:
-                raise UserError(f"{path} line {i + 2}, column {name}: {cell!r} is not a number") from None
+                valid = "is not a number; valid: a number, or nothing"
+                raise UserError(f"{path} line {i + 2}, column {name[:40]}: {cell[:40]!r} {valid}") from None
     return columns
+
+
+def parse_number(word) -> float:
+    """float(word), but without Python's own 1_000.  ValueError: no number"""
+    if "_" in word:
+        raise ValueError(f"{word[:40]!r} is no number")
+    return float(word)
 
 
 def _whole_lines(path):
     """The complete rows of a CSV file, header first."""
+    expected = f"the {METRICS} of a run"
+    text = read_text(path, expected)
     try:
-        text = Path(path).read_text()
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read {path}: {error}; give the {METRICS} of a run") from None
-    lines = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1])))
+        lines = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1]), strict=True))
+    except csv.Error as error:
+        raise UserError(f"{path}: no CSV: {error}; expected {expected}") from None
     for i, line in enumerate(lines):
         if len(line) != len(lines[0]):
-            raise UserError(f"{path} line {i + 1} has {len(line)} cells; the header has {len(lines[0])}")
+            raise UserError(f"{path} line {i + 1} has {len(line)} cells; valid: {len(lines[0])}, as in the header")
     return lines
 
 

@@ -12,6 +12,7 @@ Columns, named in the first line, in any order; others are ignored:
 
 Also known: `t`, `timestamp`; `hmd_`, `headset_`; `left_hand_`, `left_controller_`; `_pos_x`, `_rot_x`.  An empty cell,
 `nan` or `null` says that the device is not tracked.  Quaternions are x, y, z, w here, w, x, y, z behind `to_world`.
+With the headset alone (`--sensors hmd`, §4.2) the controllers' columns are neither needed nor read.
 
 Nothing here looks ahead, and memory does not grow with the length of a stream.
 """
@@ -24,17 +25,18 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from env import BAD, SUBSTEPS, fallen, observation_terms, observe
+from character import Character, geom_lowest
+from env import BAD, SUBSTEPS, fallen, observation_terms, observe, slices_of
 from mocap import CONTROL_RATE, heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate, quat_slerp
-from retarget import STAGE_VEL, Character, geom_lowest
-from runs import UserError
+from retarget import STAGE_VEL, Reference
+from runs import UserError, parse_number
 
 DEVICES = ("head", "left", "right")
 PARTS = ("px", "py", "pz", "qx", "qy", "qz", "qw")
@@ -74,11 +76,13 @@ class Reader:
     name   : of the source, for complaints
     strict : a line that cannot be read is an error (files); otherwise it is skipped and counted (live streams), and
              100 of them in a row are an error.  A file's last line may be cut short: it is skipped
-    Test     tests/test_stream.py::test_columns, test_garbage_lines, test_garbage_on_stdin
+    devices : 3, or 1: the headset's columns alone
+    Test     tests/test_stream.py::test_columns, test_garbage_lines, test_garbage_on_stdin, test_headset_only
     """
 
-    def __init__(self, name: str, strict=True):
+    def __init__(self, name: str, strict=True, devices=3):
         self.name, self.strict = name, strict
+        self.wanted = COLUMNS[: 1 + devices * len(PARTS)]
         self.line = self.unreadable = self.in_a_row = 0
         self.at = self.names = None
 
@@ -93,6 +97,8 @@ class Reader:
             if not cells or cells.startswith("#"):
                 continue
             if self.at is None:
+                if "\0" in text:
+                    raise UserError(f"{self.name}, line {self.line}: UTF-16 or no text; valid: a CSV's lines in UTF-8")
                 self.header(cells)
                 continue
             try:
@@ -113,7 +119,7 @@ class Reader:
         """The first line: where which column is."""
         self.names = [c.strip() for c in line.split(",")]
         known = [column(c) for c in self.names]
-        missing = [c for c in COLUMNS[1:] if c not in known]
+        missing = [c for c in self.wanted[1:] if c not in known]
         twice = [c for c, k in Counter(known).items() if c and k > 1]
         if twice:
             raise UserError(f"{self.name}, line {self.line}: column {twice[0]} is there twice; valid: once each")
@@ -123,7 +129,7 @@ class Reader:
                 f"{self.name}, line {self.line}: no column {', '.join(missing[:4])}{more}; "
                 f"it has {', '.join(self.names)[:200]}; valid: {valid_columns()}"
             )
-        self.at = [known.index(c) if c in known else -1 for c in COLUMNS]
+        self.at = [known.index(c) if c in known else -1 for c in self.wanted]
 
     def values(self, line):
         """The numbers of a row in the order of COLUMNS.  ValueError: which column, and why."""
@@ -136,7 +142,7 @@ class Reader:
             cell = cells[i].strip().strip('"') if i >= 0 else ""
             if cell.lower() not in EMPTY:
                 try:
-                    out[k] = float(cell)
+                    out[k] = parse_number(cell)
                 except ValueError:
                     raise ValueError(f"column {self.names[i]}: {cell[:40]!r}; valid: a number, or nothing") from None
         return out
@@ -245,6 +251,21 @@ CLOCK_AHEAD, CLOCK_BACK = 5.0, 1.0  # s: farther jumps of the time column are an
 NEUTRAL = np.array([[0.0, 0.0, 0.0], [-0.04, 0.26, -0.90], [-0.04, -0.26, -0.90]])
 
 
+def controllers_hang(ref: Reference) -> Reference:
+    r"""The reference with controllers that hang beside the user, wherever the headset goes  [Reda23 §4.2].
+
+    Equation  p_i = p_head + s ⊙ R_z(ψ) n_i,  R_i = R_z(ψ): ψ the headset's heading, s the reference's scale, n NEUTRAL
+    Why       how a policy that was trained with three devices is driven with one.  ASSUMED: §4.2 does not say; it is
+              also what `Guard` gives for controllers that were never seen
+    Test      tests/test_stream.py::test_controllers_hang
+    """
+    turn = quat_about(2, heading(ref.sensor_quat[:, 0]))[:, None]  # (F, 1, 4)
+    pos, quat = ref.sensor_pos.copy(), ref.sensor_quat.copy()
+    pos[:, 1:] = pos[:, :1] + ref.scale[:, None] * quat_rotate(turn, NEUTRAL[1:])
+    quat[:, 1:] = turn
+    return replace(ref, sensor_pos=pos, sensor_quat=quat, sensor_rot=quat_matrix(quat)[..., :2].astype(np.float32))
+
+
 class Clock:
     """The time column -> seconds since the first row, never backwards.
 
@@ -327,13 +348,14 @@ class Guard:
     Anchor    a headset that comes back, or moves between two rows, by more than 1 m has been teleported: the whole
               stream is then shifted and turned about the vertical, so that the headset goes on from where it was (its
               height only if that changed by more than 0.5 m)
+    Devices   with `devices` 1 there are no controllers: they hang beside the body, and nothing is lost
     Frame     `to_world`'s, quaternion w, x, y, z; times from `Clock`
     Test      tests/test_stream.py::test_zero_rows, test_nan_rows, test_frozen_sensor, test_drop_out, test_teleport,
               test_controller_glitch, test_never_nan
     """
 
-    def __init__(self, rate=CONTROL_RATE):
-        self.rate, self.t = rate, None
+    def __init__(self, rate=CONTROL_RATE, devices=3):
+        self.rate, self.devices, self.t = rate, devices, None
         self.tracks = [Track() for _ in DEVICES]
         self.yaw, self.shift = 0.0, np.zeros(3)  # the anchor: p' = R_z(yaw) p + shift
         self.events, self.seconds = Counter(), Counter()  # (device, what) -> how often, how long
@@ -358,6 +380,8 @@ class Guard:
         """What happened, one line a kind.  Test: tests/test_stream.py::test_zero_rows"""
         lines = []
         for key, n in sorted(self.events.items()):
+            if key[0] not in DEVICES[: self.devices]:
+                continue
             lasted = f", {self.seconds[key]:.2f} s" if self.seconds[key] else ""
             lines.append(f"{' '.join(key)}: {n} time{'s' * (n > 1)}{lasted}")
         return lines
@@ -493,7 +517,7 @@ class Resampler:
         return out
 
 
-CALIBRATION = 1.0  # s of headset
+CALIBRATION, SEEN = 1.0, 1000  # s of headset; readings kept of it: of a faster stream every other one
 STANDING = (1.0, 1.9)  # m, where the headset of a standing user may be; otherwise the floor is not at height 0
 AVERAGE = 1.64  # m, headset of a user of 1.75 m, taken where the floor is not known.  ASSUMED
 
@@ -554,14 +578,17 @@ class Stream:
     """Samples as they come -> poses at the control rate in the character's world.
 
     axes, grip  : as `to_world`; sample_rate : of a stream without times [Hz]; user_height : as `calibrate`
+    devices     : as `Guard`
     Test          tests/test_stream.py::test_round_trip, test_never_nan
     """
 
-    def __init__(self, char, axes="unity", rate=CONTROL_RATE, sample_rate=SAMPLE_RATE, grip=None, user_height=None):
+    def __init__(
+        self, char, axes="unity", rate=CONTROL_RATE, sample_rate=SAMPLE_RATE, grip=None, user_height=None, devices=3
+    ):
         if axes not in AXES:
             raise UserError(f"--axes {axes}: unknown; valid: {', '.join(AXES)}")
         self.char, self.axes, self.grip, self.user_height = char, axes, grip, user_height
-        self.clock, self.guard, self.resampler = Clock(sample_rate), Guard(rate), Resampler(rate)
+        self.clock, self.guard, self.resampler = Clock(sample_rate), Guard(rate, devices), Resampler(rate)
         self.calibration, self.seen, self.rows = None, [], 0
 
     def push(self, sample: Sample) -> list[Sample]:
@@ -584,6 +611,7 @@ class Stream:
                 ticks += [self.calibration.apply(tick) for tick in self.resampler.push(s)]
             elif self.guard.live():
                 self.seen.append((s.t, s.pos[0], s.quat[0]))
+                self.seen = self.seen if len(self.seen) <= SEEN else self.seen[::2]
                 if self.tracked() >= CALIBRATION:
                     _, pos, quat = zip(*self.seen, strict=True)
                     self.calibration = calibrate(self.char, np.array(pos), np.array(quat), self.user_height)
@@ -626,24 +654,23 @@ class Player:
               headset again: the state given out is always finite
     Errors    distances of the character's headset and controller sites from the poses it is given, over all ticks
     Args      act : observation (1, n) -> action (1, u); force : (seconds, root yaw) -> (3,) [N] on the root, world
+              devices : 3, or 1 for a policy that sees the headset alone
     Test      tests/test_stream.py::test_player_observes_as_env, test_stand, test_falls_are_counted, test_never_nan
     """
 
     ENDS = ("fall", "away", "bad")
 
-    def __init__(self, char: Character, act, rate=CONTROL_RATE, substeps=SUBSTEPS, force=None):
+    def __init__(self, char: Character, act, rate=CONTROL_RATE, substeps=SUBSTEPS, force=None, devices=3):
         self.char, self.act, self.dt, self.substeps, self.force = char, act, 1.0 / rate, substeps, force
+        self.devices = devices
         char.model.opt.timestep = self.dt / substeps
         self.batch = char.batch(1, 1)
         names = "qpos qvel ctrl qacc_warmstart xfrc_applied xpos xmat cvel geom_xpos geom_xmat site_xpos"
         for name in names.split():
             setattr(self, name, self.batch.bind(name))
-        self.slices, start = {}, 0
-        for name, size in observation_terms(char)["actor"].items():
-            self.slices[name] = slice(start, start + size)
-            start += size
-        self.obs_size, self.action_size = start, len(char.limits)
-        self.obs = np.zeros((1, start), np.float32)
+        self.slices = slices_of(observation_terms(char, devices, asymmetric=False))
+        self.obs_size, self.action_size = self.slices["user"].stop, len(char.limits)
+        self.obs = np.zeros((1, self.obs_size), np.float32)
         self.headset = headset(char)
         self.before, self.ticks, self.ends = None, 0, Counter()
         self.head_error = self.hand_error = 0.0  # sums [m]
@@ -653,6 +680,7 @@ class Player:
         """The default pose under a headset.  pos (3, 3), quat (3, 4), world  Test: tests/test_stream.py::test_stand"""
         turn = quat_about(2, heading(quat[0]))
         place = pos[0] - quat_rotate(turn, self.headset)
+        turn = quat_mul(turn, self.char.rest[self.char.root])
         self.qpos[0] = [*place[:2], self.char.hip_height, *turn, *self.char.default]
         for array in (self.qvel, self.ctrl, self.qacc_warmstart, self.xfrc_applied):
             array[0] = 0.0
@@ -665,13 +693,14 @@ class Player:
         Args      pos (3, 3), quat (3, 4) of this tick
         Returns   why it had to stand anew, one of ENDS, or None"""
         start = time.perf_counter()
-        now = (pos[None], quat_matrix(quat)[None, ..., :2].astype(np.float32))
+        seen = slice(0, self.devices)
+        now = (pos[None, seen], quat_matrix(quat)[None, seen, :, :2].astype(np.float32))
         if self.before is None:
             self.stand(pos, quat)
             self.before = now
         error = np.linalg.norm(self.site_xpos[0, self.char.sensor_sites] - pos, axis=-1)
         self.head_error += error[0]
-        self.hand_error += error[1:].mean()
+        self.hand_error += error[1:].mean()  # not reported where there are no controllers
         observe(self, slice(None), self.before, now, self.obs)
         action = self.act(self.obs)
         self.ctrl[:] = np.clip(action, -1.0, 1.0)
@@ -708,10 +737,10 @@ class Player:
         ends = f"{self.ends['fall']} falls, {self.ends['away']} times lost the user, {self.ends['bad']} diverged"
         every = f"one every {seconds / n:.1f} s" if n else "none"
         torque, state = (1000 * np.percentile(k, [50, 99]) for k in np.array(self.latency).T)
+        hands = f"hand error {100 * self.hand_error / self.ticks:.1f} cm, " if self.devices == 3 else ""
         return [
             f"{seconds:.1f} s played: {ends} ({every})",
-            f"head error {100 * self.head_error / self.ticks:.1f} cm, "
-            f"hand error {100 * self.hand_error / self.ticks:.1f} cm, mean over all ticks",
+            f"head error {100 * self.head_error / self.ticks:.1f} cm, {hands}mean over all ticks",
             f"latency: sensors to torque p50 {torque[0]:.2f} ms, p99 {torque[1]:.2f} ms; "
             f"with the physics p50 {state[0]:.2f} ms, p99 {state[1]:.2f} ms",
         ]

@@ -876,9 +876,10 @@ def test_cmu_floor(mocap_dir, subject):
 
 def test_retargeted(mocap_dir):
     """The first character walks as a CMU subject does, with soles on the floor."""
+    import character
     import retarget
 
-    char = retarget.character("jesse")
+    char = character.load("jesse")
     for name in ("07/07_03", "08/08_04", "16/16_15", "35/35_02"):
         clip = mocap.load(mocap_dir / "cmu" / f"{name}.amc")[0]
         a = retarget.artefacts(char, clip, retarget.retarget(char, clip))

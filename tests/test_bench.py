@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 import bench
+import character
 import mocap
 import retarget
 from env import Env
@@ -26,7 +27,7 @@ def test_bench_json(tmp_path, capsys):
 
 def test_physics_is_the_same_physics():
     """`mujoco.rollout` from a reference state arrives where `Env.step` does."""
-    char = retarget.character("jesse")
+    char = character.load("jesse")
     clips = [c for c in mocap.builtin_clips() if c.name.startswith("walk")][:1]
     env = Env(char, retarget.reference(char, clips), 4, threads=1)
     physics = bench.Physics(env, np.random.default_rng(0))
@@ -41,3 +42,17 @@ def test_physics_is_the_same_physics():
     alive = env.steps > 0
     assert alive.any()
     np.testing.assert_allclose(physics.state[alive, start : start + nq], env.qpos[alive], atol=1e-9)
+
+
+def test_physics_table():
+    """Few sub-steps are cheaper; the reference agrees with itself; settings are put back."""
+    char = character.load("jesse")
+    ref = retarget.reference(char, [c for c in mocap.builtin_clips() if c.name.startswith("walk")][:1])
+    before = char.model.opt.solver, char.model.opt.iterations
+    rows = bench.physics_table(char, ref, lambda env: np.zeros((env.n, env.action_size)), 32, 0.3, threads=1)
+    by = {(r["substeps"], r["solver"], r["iterations"]): r for r in rows}
+    assert list(by) == bench.SETTINGS and rows[0]["root_mm"] == 0.0
+    assert by[16, "NEWTON", 50]["control_steps_per_s"] < by[2, "PGS", 5]["control_steps_per_s"]
+    assert by[4, "PGS", 10]["root_mm"] < by[2, "PGS", 5]["root_mm"] < 50
+    assert all(r["bad"] == 0 and 0 < r["sole_mm"] < 50 and r["survived"] > 0.5 for r in rows)
+    assert before == (char.model.opt.solver, char.model.opt.iterations)

@@ -469,6 +469,20 @@ def test_damaged_files_never_escape(tmp_path_factory, data):
         assert np.isfinite(bvh.global_pose(clip)[0]).all()
 
 
+def test_long_lists():
+    """A message lists a hundred names, and says how many there are."""
+    assert bvh.listed("ab") == "a, b" and bvh.listed([]) == ""
+    said = bvh.listed(map(str, range(10_000)))
+    assert said.startswith("0, 1, ") and said.endswith("98, 99, … (10000)")
+
+
+def test_outline():
+    """A branch, and a chain of 10,000 joints, whose listing stays linear."""
+    assert bvh.outline(["a", "b", "c", "d"], [-1, 0, 1, 0]) == ["a", "  b", "    c", "  d"]
+    lines = bvh.outline(["x"] * 10_000, range(-1, 9_999))
+    assert lines[39] == " " * 78 + "x" and {len(line) for line in lines[40:]} == {81}
+
+
 def test_missing_file_names_itself(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere.bvh"):
         bvh.read(tmp_path / "nowhere.bvh")

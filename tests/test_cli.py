@@ -18,6 +18,7 @@ from test_mocap import walk, write_as
 from test_rigs import write_rig
 
 import bvh
+import character
 import mocap
 import play
 import ppo
@@ -64,8 +65,8 @@ def refuse(capsys, folder, script, *args):
 
 
 def small_policy(path, char="jesse"):
-    ref = retarget.reference(retarget.character(char), [mocap.load("builtin", clips="stand_007")[0][:10]])
-    env = Env(retarget.character(char), ref, 1, threads=1)
+    ref = retarget.reference(character.load(char), [mocap.load("builtin", clips="stand_007")[0][:10]])
+    env = Env(character.load(char), ref, 1, threads=1)
     policy = Policy(env.obs_size, env.critic_size, env.action_size, (8,), (4,), 0.1, 1.0, np.random.default_rng(0))
     save_checkpoint(path, policy.arrays(), {"policy": policy.shape()})
     return path
@@ -128,7 +129,7 @@ def test_wrong_character(script, here, capsys):
         ("name = [", "bob.toml"),
         ('name = "bob"', "no table [root]"),
         (b"\xff\xfe", "bob.toml"),
-        ((retarget.CHARACTERS / "jesse.toml").read_text(), "jesse.xml"),  # its model is not beside it
+        ((character.CHARACTERS / "jesse.toml").read_text(), "jesse.xml"),  # its model is not beside it
     ):
         bad.write_bytes(text.encode() if isinstance(text, str) else text)
         assert words in refuse(capsys, here, script, "--character", bad, *more)

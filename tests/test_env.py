@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import character
 import env as envs
 import gait
 import mocap
 import retarget
+from character import TERMS
 from env import Disturbance, Env, HeadingFrame
 from mocap import Clip
-from retarget import STAGE_VEL, TERMS
+from retarget import STAGE_VEL
 from runs import UserError
 
 N = 8
@@ -33,7 +35,7 @@ def clips():
 
 @pytest.fixture(scope="module")
 def shared():
-    return retarget.character("jesse")
+    return character.load("jesse")
 
 
 @pytest.fixture
@@ -171,6 +173,70 @@ def test_heading_invariance(char, clips, ref, rng, pitch):
         np.testing.assert_allclose(ta[name], tb[name], rtol=1e-4, atol=1e-7, err_msg=name)
 
 
+def test_headset_only(shared, ref, rng):
+    """§4.2: the observation without the controllers' numbers, and nothing else is different."""
+    less = envs.headset_only(ref)
+    assert less.sensor_pos.shape == (len(ref), 1, 3) and ref.sensor_pos.shape == (len(ref), 3, 3)
+    for asymmetric in (True, False):
+        a, b = (Env(shared, r, N, seed=1, asymmetric=asymmetric) for r in (ref, less))
+        a.reset(), b.reset()
+        for _ in range(3):
+            action = 0.2 * rng.standard_normal((N, 33))
+            out_a, out_b = a.step(action), b.step(action)
+            np.testing.assert_array_equal(out_a[1], out_b[1])
+        names = envs.input_names(shared, 3, asymmetric)
+        keep = [names.index(n) for n in envs.input_names(shared, 1, asymmetric)]
+        assert b.obs_size == a.obs_size - 2 * 18 and b.full.shape[1] == a.full.shape[1] - 36 == len(keep)
+        np.testing.assert_array_equal(b.full, a.full[:, keep])
+        np.testing.assert_array_equal(b.full[:, : b.obs_size], a.full[:, keep[: b.obs_size]])
+        for i in range(N):
+            want = slow_observation(a, i)
+            for name in ("user_previous", "user"):  # headset's position and six numbers of its rotation
+                nine = np.concatenate([want[name][:3], want[name][9:15]])
+                np.testing.assert_allclose(b.full[i, b.slices[name]], nine, atol=2e-5)
+    noisy = Env(shared, less, 300, disturbance=Disturbance(0.05, 0.02))
+    plain = Env(shared, less, 300)
+    noisy.reset(frames=np.full(300, 9)), plain.reset(frames=np.full(300, 9))
+    noisy.step(np.zeros((300, 33))), plain.step(np.zeros((300, 33)))
+    error = (noisy.full - plain.full)[:, noisy.slices["user"]]
+    assert error[:, :3].std() == pytest.approx(np.hypot(0.05, 0.02), rel=0.15) and not error[:, 3:].any()
+
+
+def test_input_names(shared, ref):
+    """Each name where the observation has that number: looked up in MuJoCo's own arrays."""
+    env = Env(shared, ref, 2, seed=1)
+    env.reset()
+    names, m = envs.input_names(shared), shared.model
+    assert len(names) == len(set(names)) == env.full.shape[1]
+    at = lambda name: env.full[:, names.index(name)]  # noqa: E731
+    for hinge in ("knee_l_y", "hip_r_z"):
+        k = m.joint(hinge).qposadr[0]
+        np.testing.assert_allclose(at(f"q.{hinge}"), env.qpos[:, k], rtol=1e-6)
+        np.testing.assert_allclose(at(f"qd.{hinge}"), env.qvel[:, k - 1], rtol=1e-6)
+    for body in ("head", "foot_r"):
+        np.testing.assert_allclose(at(f"x.{body}.z"), env.xpos[:, m.body(body).id, 2], rtol=1e-5)
+        np.testing.assert_allclose(at(f"R.{body}.R4"), env.xmat[:, m.body(body).id, 6], atol=1e-5)  # row 2, column 0
+    np.testing.assert_allclose(at("user.r.z"), ref.sensor_pos[env.frame, 2, 2], rtol=1e-5)
+    assert set(envs.input_names(shared, 1)) < set(names) and "human_pos_in_15.44" in names
+
+
+def test_symmetric_critic(shared, ref, rng):
+    """§5.3: the critic sees what the actor sees; the actor, the rewards and the motion do not change."""
+    a, b = Env(shared, ref, N, seed=1, horizon=6), Env(shared, ref, N, seed=1, horizon=6, asymmetric=False)
+    a.reset(), b.reset()
+    assert b.critic_size == b.obs_size == a.obs_size < a.critic_size and b.terms["critic"] == {}
+    for _ in range(8):  # across resets
+        action = 0.2 * rng.standard_normal((N, 33))
+        (obs_a, reward_a, *ends_a, info_a), (obs_b, reward_b, *ends_b, info_b) = a.step(action), b.step(action)
+        np.testing.assert_array_equal(obs_a, obs_b)
+        np.testing.assert_array_equal(reward_a, reward_b)
+        np.testing.assert_array_equal(ends_a, ends_b)
+        assert info_b["critic"].shape == obs_b.shape
+        assert ("final_obs" in info_a) == ("final_obs" in info_b)
+        if "final_obs" in info_a:
+            np.testing.assert_array_equal(info_a["final_obs"], info_b["final_critic"])
+
+
 def test_heading_does_not_flip():
     """Bending over to looking straight up: the devices in front stay in front."""
     pitch = np.linspace(-3.0, 3.0, 61)
@@ -190,8 +256,8 @@ def test_heading_does_not_flip():
 def test_reward_terms(char, ref, rng):
     """Eqs. 8 to 11 and the App. A distances as loops; first the functions, then the environment's own terms."""
     w, k = 2.5, 6.0
-    q, q2, weights = rng.normal(size=(3, 33)), rng.normal(size=(3, 33)), retarget.normalised(rng.uniform(0, 1, 33))
-    x, x2, wl = rng.normal(size=(3, 6, 3)), rng.normal(size=(3, 6, 3)), retarget.normalised([1, 1, 2, 0, 3, 1])
+    q, q2, weights = rng.normal(size=(3, 33)), rng.normal(size=(3, 33)), character.normalised(rng.uniform(0, 1, 33))
+    x, x2, wl = rng.normal(size=(3, 6, 3)), rng.normal(size=(3, 6, 3)), character.normalised([1, 1, 2, 0, 3, 1])
     quat, quat2 = (Rotation.random(6, rng=rng).as_quat(scalar_first=True).reshape(3, 2, 4) for _ in range(2))
     c, c2 = np.array([[1, 0], [1, 1], [0, 1]], bool), np.array([[1, 0], [0, 0], [1, 1]], bool)
     for n in range(3):
@@ -268,6 +334,41 @@ def test_zero_weight_adds_nothing(shared, char, ref, rng):
     assert not wander(env, rng, 1)[4]["terms"]["contact"].any()
 
 
+def test_ablated(shared, char, clips, ref, rng):
+    """§3.5.1, §4.3: exactly the terms named are gone; the others, and the character, stay."""
+    names = {"contact": {"contact"}, "orientation": {"orientation"}, "action": {"action_diff", "action_min"}}
+    names |= {"imitation": {"q", "qd", "x", "xd"}, "asymmetric": set()}
+    assert set(envs.WITHOUT) == set(names)
+    full = Env(char, ref, N, seed=2)
+    full.reset()
+    action = rng.uniform(-1, 1, (N, 33))
+    _, reward, *_, info = full.step(action)
+    for without in (*((n,) for n in names), ("contact", "imitation"), ("orientation", "action")):
+        gone = set().union(*(names[n] for n in without))
+        less = envs.ablated(char, without)
+        assert {t for t in TERMS if less.reward[t][0] == 0.0} == gone
+        assert all(less.reward[t] == char.reward[t] for t in TERMS if t not in gone)
+        env = Env(less, ref, N, seed=2)
+        env.reset()
+        _, found, *_ = env.step(action)
+        np.testing.assert_allclose(found, reward - sum(info["terms"][t] for t in gone), atol=1e-12)
+    assert char.reward["q"][0] > 0 and char.reward["fail"] == envs.ablated(char, ("action",)).reward["fail"]
+
+    root = envs.ablated(char, track="root")
+    assert {t for t in TERMS if root.reward[t][0] == 0.0} == {"q", "qd", "xd"}
+    env = Env(root, retarget.reference(root, clips), N, seed=2)
+    env.reset()
+    terms, (w, k) = env.step(action)[4]["terms"], char.reward["x"]
+    for i in np.flatnonzero(env.steps):  # those that did not begin anew
+        d = np.sum((env.qpos[i, :3] - ref.qpos[env.frame[i], :3]) ** 2)
+        assert terms["x"][i] == pytest.approx(w * math.exp(-k * d), rel=1e-6)
+        assert terms["orientation"][i] == pytest.approx(info["terms"]["orientation"][i])
+    assert len(char.reward_links) == 6  # the argument is as it was
+    for wrong in ({"without": ["gravity"]}, {"track": "head"}, {"without": ["imitation"], "track": "root"}):
+        with pytest.raises(UserError, match="valid: contact, orientation, action|valid: all, root|no --without im"):
+            envs.ablated(char, **wrong)
+
+
 # ----------------------------------------------------------------------------------------- physics
 
 
@@ -290,6 +391,24 @@ def test_kinematics_are_fresh(shared, ref, rng):
         np.testing.assert_allclose(velocities[i], [velocity(d, b)[1] for b in links], atol=1e-9)
     env.batch.step()  # without the refresh they would lag
     assert np.abs(env.xpos[0] - fresh(env, 0).xpos).max() > 1e-4
+
+
+def test_refresh_changes_nothing(shared, ref, rng):
+    """It leaves contacts and limits out; where the bodies are, and all later physics, are as with MuJoCo's own."""
+    a, b = Env(shared, ref, N, seed=4), Env(shared, ref, N, seed=4)
+    for e in (a, b):
+        e.reset()
+        e.qpos[0, 2] -= 0.03  # into the floor
+    for _ in range(3):
+        action = rng.uniform(-1, 1, (N, 33))
+        for e in (a, b):
+            e.ctrl[:] = action
+        a.batch.step(nstep=4)
+        a.refresh()
+        b.batch.step(nstep=4, stage=STAGE_VEL)
+        for name in ("qpos", "qvel", "warmstart", "xpos", "xmat", "xquat", "cvel", "com", "geom_xpos", "geom_xmat"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+        assert np.abs(b.sensordata).max() > 10.0  # feet press on the floor
 
 
 def test_step_is_four_mj_steps(shared, ref, rng):
@@ -315,7 +434,7 @@ def test_step_is_four_mj_steps(shared, ref, rng):
 
 def test_contact_forces(ref, rng):
     """A statue stands on both feet and they carry its weight; in the air there is no contact at all."""
-    statue = retarget.character("jesse")
+    statue = character.load("jesse")
     m = statue.model
     m.jnt_stiffness[1:] *= 50.0
     m.dof_damping[6:] *= 50.0
@@ -346,7 +465,8 @@ def test_contact_is_that_of_the_last_substep(shared, ref, rng):
     datas = [mujoco.MjData(m) for _ in range(N)]
     for i, d in enumerate(datas):
         d.qpos[:], d.qvel[:] = env.qpos[i], env.qvel[i]
-    seen = set()
+    seen, forces, contact = set(), [], env._contact
+    env._contact = lambda: (forces.append(env.sensordata.copy()), contact())[1]
     for _ in range(3):
         action = 0.2 * rng.standard_normal((N, 33))
         env.step(action)
@@ -362,7 +482,7 @@ def test_contact_is_that_of_the_last_substep(shared, ref, rng):
                 mujoco.mj_contactForce(m, d, c, force)
                 if len(foot):
                     total[foot[0]] += d.contact[c].frame.reshape(3, 3).T @ force[:3]
-            np.testing.assert_allclose(env.sensordata[i, shared.contact_adr], total[:, 2], rtol=1e-4, atol=1e-3)
+            np.testing.assert_allclose(forces[-1][i, shared.contact_adr], total[:, 2], rtol=1e-4, atol=1e-3)
             assert list(env.contact[i]) == [abs(total[s, 2]) > 1.0 for s in range(2)]
             seen |= set(env.contact[i].tolist())
     assert seen == {True, False}
@@ -500,7 +620,7 @@ def test_fall_is_contact(shared, ref):
     env.qpos[:, 7:] = rng.uniform(shared.ranges[:, 0], shared.ranges[:, 1], (n, 33))
     env.qpos[:, 2] = rng.uniform(0.1, 0.9, n)
     env.batch.forward(None, STAGE_VEL)
-    found = envs.fallen(retarget.geom_lowest(m, shared.fall_geoms, env.geom_xpos, env.geom_xmat).min(1))
+    found = envs.fallen(character.geom_lowest(m, shared.fall_geoms, env.geom_xpos, env.geom_xmat).min(1))
     legs = 0
     for i in range(n):
         d = fresh(env, i)
@@ -693,36 +813,38 @@ def test_state_continues_exactly(shared, ref):
 
 
 def test_balanced_starts(char):
-    """Where episodes last a tenth as long, ten times as many begin; all else is uniform, seeded and resumed exactly."""
-    clips = [mocap.builtin_clips()[0][:151], mocap.builtin_clips()[1][:121]]
+    """Half of the time by frames, half by failures: against simulated episodes; seeded and resumed exactly."""
+    clips = [c[:n] for c, n in zip(mocap.builtin_clips(), (151, 121, 211), strict=False)]
     ref = retarget.reference(char, clips)
-    env = Env(char, ref, 4000, threads=1, balance=True)
-    assert env.bin_size.sum() == len(env.starts)
-    ids = np.arange(env.n)
+    env = Env(char, ref, 6000, threads=1, horizon=100, balance=True)
+    ids, frames = np.arange(env.n), np.array([149, 119, 209])
     counts = np.bincount(env._draw(ids), minlength=len(ref))
     assert set(np.flatnonzero(counts)) <= set(env.starts) and counts[env.starts].min() > 0  # any start, nothing else
-    expected = env.n / len(env.starts)
+    expected = env.n / len(env.starts)  # before anything has failed: by frames
     assert abs(counts[env.starts].mean() - expected) < 1e-9 and counts.max() < 3 * expected
-    hard = 2
-    env.life[hard] /= 10
-    frames = env._draw(ids)
-    in_hard = np.isin(frames, env.starts[env.bin_first[hard] : env.bin_first[hard] + env.bin_size[hard]])
-    np.testing.assert_array_equal(env.bin == hard, in_hard)
-    share = 10 * env.bin_size[hard] / (env.bin_size.sum() + 9 * env.bin_size[hard])
-    assert in_hard.mean() == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / env.n))
+    hazard = np.array([0.001, 0.05, 0.004])  # failures a step
+    env.failed[:], env.lived[:] = 7.0, 7.0 / hazard
+    starts = np.bincount(env.owner[env._draw(ids)], minlength=3)
+    rng = np.random.default_rng(0)
+    life = np.array([np.minimum(rng.geometric(h, 200_000), 100).mean() for h in hazard])  # steps of an episode
+    time = frames / frames.sum() + frames * hazard / (frames @ hazard)  # the share wanted, times two
+    np.testing.assert_allclose(starts * life / (starts @ life), time / 2, atol=0.03)
 
     small = Env(char, ref, 8, threads=1, seed=1, balance=True)
     small.reset(1)
-    before, starts = small.life.copy(), small.bin.copy()
-    lived = np.zeros(8, int)
-    while not lived.any():
-        _, _, terminated, _, info = small.step(np.zeros((8, small.action_size)))
-        lived = np.where(terminated, info["length"], 0)
-    for i in np.flatnonzero(lived)[-1:]:
-        assert small.life[starts[i]] == pytest.approx(before[starts[i]] + 0.3 * (lived[i] - before[starts[i]]))
+    while True:
+        before, where = (small.failed.copy(), small.lived.copy()), small.sequence.copy()
+        _, _, terminated, truncated, info = small.step(np.zeros((8, small.action_size)))
+        if terminated.any():
+            break
+    failed, lived = before
+    for i in np.flatnonzero(terminated | truncated):
+        failed[where[i]] = 0.9 * failed[where[i]] + terminated[i]
+        lived[where[i]] = 0.9 * lived[where[i]] + info["length"][i]
+    np.testing.assert_allclose(small.failed, failed)
+    np.testing.assert_allclose(small.lived, lived)
     other = Env(char, ref, 8, threads=1, seed=5, balance=True)
     other.load_state(*small.state())
     for _ in range(30):
         a = np.full((8, small.action_size), 0.1)
         np.testing.assert_array_equal(small.step(a)[0], other.step(a)[0])
-    np.testing.assert_array_equal(small.life, other.life)

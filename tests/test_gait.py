@@ -133,8 +133,9 @@ def test_jog_flies():
     assert (np.linalg.norm(np.diff(clip["pos"][:, 0], 2, axis=0), axis=1) * 3600).max() < 1.2 * gait.GRAVITY
 
 
-@pytest.mark.parametrize("kind, speed", [("walk", 0.5), ("walk", 1.0), ("walk", 1.6), ("jog", 2.0), ("jog", 3.0),
-                                         ("turn", 1.0)])
+@pytest.mark.parametrize(
+    "kind, speed", [("walk", 0.5), ("walk", 1.0), ("walk", 1.6), ("jog", 2.0), ("jog", 3.0), ("turn", 1.0)]
+)
 def test_speed_is_what_was_asked_for(kind, speed):
     clip = gait.generate(kind, 20, seed=5, speed=speed)
     stride = round(clip["rate"] / float(gait.stride_frequency(speed, jog=kind == "jog")))

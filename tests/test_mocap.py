@@ -703,7 +703,7 @@ def test_load_errors(tmp_path, quick_builtin):
         return str(e.value)
 
     assert "no such file or folder" in (m := message(tmp_path / "nowhere")) and "builtin" in m and "nowhere" in m
-    assert "holds no .bvh file" in message(tmp_path)
+    assert "a folder without motion; valid: one that holds .bvh" in message(tmp_path)
     assert all(s in message("builtin", split="test") for s in ("'test'", *mocap.SPLITS))
     assert "'*fly*'" in (m := message("builtin", clips="*fly*")) and "walk_005" in m and "(20)" in m
     m = message("builtin", clips="*jog*", split="validation")
@@ -838,6 +838,27 @@ def test_resize():
     assert r.body != clip.body and clip.pos is not r.pos
 
 
+def test_resize_trunk():
+    """Against walking along the bones: every segment from its parent, the trunk's offsets stretched along the chest."""
+    clip, s = walk(seed=7), 1.2
+    r = mocap.resize(clip, 0.9, 1.1, s)
+    chest = Rotation.from_quat(clip.quat[:, SEG["chest"]], scalar_first=True)
+    expected = {"pelvis": 0.9 * clip.pos[:, 0]}
+    for child, parent in zip(SEGMENTS[1:], mocap.PARENTS[1:], strict=True):
+        bone = 0.9 * (clip.pos[:, SEG[child]] - clip.pos[:, parent])
+        if child in ("chest", "head"):
+            bone = s * bone
+        elif child.startswith("upper_arm"):
+            bone = chest.apply(chest.inv().apply(bone) * [1.0, 1.0, s])
+        elif child[:-2] in ("forearm", "hand"):
+            bone = 1.1 * bone
+        expected[child] = expected[SEGMENTS[parent]] + bone
+    for name, pos in expected.items():
+        np.testing.assert_allclose(r.pos[:, SEG[name]], pos, atol=1e-12, err_msg=name)
+    assert r.hip_height == pytest.approx(0.9 * clip.hip_height)
+    np.testing.assert_array_equal(mocap.resize(clip, trunk=1.0).pos, clip.pos)
+
+
 def test_augment():
     clips = [walk(seed=s, name=f"walk_{s}") for s in (8, 9)]
     a, b = (mocap.augment(clips, np.random.default_rng(3)) for _ in range(2))
@@ -848,6 +869,8 @@ def test_augment():
         scale = other.limb("thigh_l", "shin_l") / clip.limb("thigh_r", "shin_r")
         assert 0.8 <= scale <= 1.2 and scale != 1.0
         assert 0.8 <= other.limb("upper_arm_l", "forearm_l") / clip.limb("upper_arm_r", "forearm_r") / scale <= 1.2
+        trunk = other.limb("pelvis", "chest") / clip.limb("pelvis", "chest") / scale
+        assert 0.95 <= trunk <= 1.45 and trunk != 1.0
         assert 0.84 <= clip.seconds / other.seconds <= 1.16
-    plain = mocap.augment(clips, np.random.default_rng(3), speed=0, height=0, arms=0)
+    plain = mocap.augment(clips, np.random.default_rng(3), speed=0, height=0, arms=0, trunk=(1, 1))
     assert_same(plain[2], mocap.mirror(clips[0]))

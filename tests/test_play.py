@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import character
 import mocap
 import play
 import retarget
@@ -29,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("motions_once")
 
 @pytest.fixture(scope="module")
 def char():
-    return retarget.character("jesse")
+    return character.load("jesse")
 
 
 @pytest.fixture(scope="module")
@@ -267,7 +268,7 @@ def test_metrics_against_slow_loop(char, ref):
             points = retarget.sole_points(char, sim.geom_xpos[None], sim.geom_xmat[None])[0]  # (2, p, 3)
             soles.append(points)
             body_geoms = [g for g in range(m.ngeom) if m.geom(g).name != "floor"]
-            low = retarget.geom_lowest(m, body_geoms, sim.geom_xpos[None], sim.geom_xmat[None]).min()
+            low = character.geom_lowest(m, body_geoms, sim.geom_xpos[None], sim.geom_xmat[None]).min()
             if low < 0:
                 s["penetration_mm"].append(-1000 * low)
             if k:
@@ -550,7 +551,7 @@ def test_split_and_all(policy_file, monkeypatch):
 def test_which_policy(policy_file, tmp_path, monkeypatch, char, ref):
     with pytest.raises(UserError, match="no policy .*missing.npz: train one .*ppo.py --character jesse"):
         play.main(["--measure", "--policy", str(tmp_path / "missing.npz")])
-    monkeypatch.setattr(retarget, "CHARACTERS", tmp_path)
+    monkeypatch.setattr(character, "CHARACTERS", tmp_path)
     with pytest.raises(UserError, match="no policy .*jesse.npz"):
         play.find_policy(play.Options())
     (tmp_path / "jesse.npz").write_bytes(policy_file.read_bytes())

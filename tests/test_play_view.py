@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import character
 import mocap
 import play
 import ppo
@@ -156,7 +157,7 @@ def test_browser_shows_the_character_moving(policy, tmp_path):
 
 def test_shown_model():
     """The shown model has the character's bodies and hinges in the same places, then one body for each sensor."""
-    char = retarget.character("jesse")
+    char = character.load("jesse")
     clip = mocap.sequences("builtin", "validation")[0]
     ref = retarget.reference(char, [clip])
     shown = play._shown_model(char, ref)

@@ -14,14 +14,16 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+import character
+import env as envs
 import mocap
 import ppo
 import retarget
-from env import Disturbance, Env
+from character import TERMS
+from env import Disturbance, Env, input_names
 from nn import check_gradient, gaussian_logp
 from ppo import Options, Policy, Trainer
-from retarget import TERMS
-from runs import CHECKPOINT, CONFIG, METRICS, UserError, load_checkpoint, read_metrics, save_checkpoint
+from runs import CHECKPOINT, CONFIG, METRICS, UserError, load_checkpoint, read_config, read_metrics, save_checkpoint
 
 ROOT = Path(__file__).resolve().parent.parent
 TIMES = ("steps_per_s", "collect_s", "update_s")
@@ -33,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("motions_once")
 
 @pytest.fixture(scope="module")
 def char():
-    return retarget.character("jesse")
+    return character.load("jesse")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +50,8 @@ def tiny(**changes):
 
 def trainer_of(char, ref, episode=500, **changes):
     opt = tiny(episode=episode, **changes)
-    trainer = Trainer(opt, Env(char, ref, opt.envs, opt.seed, 1, episode))
+    env = Env(char, ref, opt.envs, opt.seed, 1, episode, asymmetric="asymmetric" not in opt.without)
+    trainer = Trainer(opt, env)
     trainer.start()
     return trainer
 
@@ -352,7 +355,9 @@ class Reach:
 
     ENDS = Env.ENDS
     obs_size, critic_size, action_size, dt = 2, 3, 1, 0.1
-    char = SimpleNamespace(name="reach", reward={k: (float(k == "q"), 1.0) for k in TERMS} | {"fail": -5.0})
+    char = SimpleNamespace(
+        name="reach", training={}, reward={k: (float(k == "q"), 1.0) for k in TERMS} | {"fail": -5.0}
+    )
 
     def __init__(self, n):
         self.n, self.full = n, np.zeros((n, 3), np.float32)
@@ -557,6 +562,7 @@ def test_resume_refuses_a_foreign_checkpoint(whole, tmp_path):
     path = tmp_path / "a" / CHECKPOINT
     for change in ({k: v for k, v in arrays.items() if "adam" not in k}, arrays | {"env.frame": np.zeros(3, int)}):
         save_checkpoint(path, change, meta)
+        path.with_suffix(".prev.npz").unlink()  # a damaged one would be replaced by the one before
         with pytest.raises(UserError, match="does not fit|no array"):
             train(tmp_path / "a", 2, "--resume")
 
@@ -571,7 +577,7 @@ def test_init_fine_tunes(whole, tmp_path, monkeypatch):
         np.testing.assert_array_equal(value, saved[name], err_msg=name)
     assert meta["updates"] == 1 and meta["steps"] == 64
     for flag in ("--hidden", "--value-hidden"):
-        with pytest.raises(UserError, match=r"networks are \(12,\), \(10, 8\): give --hidden"):
+        with pytest.raises(UserError, match=r"networks are \(12,\) and \(10, 8\), with .* give --hidden"):
             train(tmp_path / "b", 1, "--init", str(whole), flag, "9")
     policy = Policy(7, 9, 2, (4,), (4,), 0.1, 1.0, np.random.default_rng(0))
     save_checkpoint(tmp_path / "other.npz", policy.arrays(), {"policy": policy.shape()})
@@ -580,6 +586,121 @@ def test_init_fine_tunes(whole, tmp_path, monkeypatch):
     with pytest.raises(UserError, match="no checkpoint"):
         train(tmp_path / "b", 1, "--init", str(tmp_path / "missing.npz"))
     assert not (tmp_path / "b").exists()
+
+
+def test_init_widens():
+    rng = np.random.default_rng(1)
+    old = Policy(9, 11, 3, (8, 6), (7,), 0.1, 2.0, rng)
+    old.norm.update(rng.normal(2.0, 3.0, (50, 11)))
+    new = Policy(9, 11, 3, (16, 6), (12,), 0.5, 2.0, rng)
+    new.begin_from(old, "a.npz", rng)
+    x = rng.normal(2.0, 3.0, (20, 11)).astype(np.float32)
+    np.testing.assert_allclose(new.mean_action(x[:, :9]), old.mean_action(x[:, :9]), atol=1e-6)
+    np.testing.assert_allclose(new.value(new.norm.normalise(x)), old.value(old.norm.normalise(x)), rtol=1e-5)
+    np.testing.assert_array_equal(new.log_std, old.log_std)
+    with pytest.raises(UserError, match="a.npz: its networks are"):
+        Policy(9, 11, 3, (8, 5), (7,), 0.1, 2.0, rng).begin_from(old, "a.npz", rng)
+
+
+def test_init_symmetric(whole, tmp_path, capsys, char, ref):
+    """§5.3: the actor goes on, the critic, which sees less, begins; the other way round nothing fits."""
+    _, meta = train(tmp_path / "a", 1, "--init", str(whole), "--without", "asymmetric")
+    says = f"{whole}: its critic sees 459 numbers, this one's only the actor's 189: the critic begins anew"
+    assert says in capsys.readouterr().out
+    assert meta["options"]["without"] == ["asymmetric"] and meta["policy"]["critic_size"] == 189
+    old, _ = ppo.load_policy(whole)
+    new = trainer_of(char, ref, without=("asymmetric",)).policy
+    critic = new.critic.theta.copy()
+    new.begin_from(old, "a.npz", np.random.default_rng(0))
+    x = np.random.default_rng(1).normal(size=(20, 189)).astype(np.float32)
+    np.testing.assert_allclose(new.mean_action(x), old.mean_action(x), atol=1e-6)
+    np.testing.assert_array_equal(new.critic.theta, critic)
+    with pytest.raises(UserError, match="with 189 inputs for the critic"):
+        train(tmp_path / "b", 1, "--init", str(tmp_path / "a"))
+
+
+def test_init_headset_only(whole, tmp_path, char):
+    """§4.2: where the controllers' numbers are at their means, the policy without them does and expects the same."""
+    rng = np.random.default_rng(0)
+    old, _ = ppo.load_policy(whole)
+    keep = [input_names(char).index(n) for n in input_names(char, 1)]
+    new = old.rearranged(keep, 189 - 36, np.arange(33))
+    gone = np.setdiff1d(np.arange(459), keep)
+    assert (new.obs_size, new.critic_size) == (153, 423) and len(gone) == 36 and gone.max() < 189
+    x = (old.norm.mean + rng.normal(size=(50, 459)) / old.norm.inv_std).astype(np.float32)
+    x[:, gone] = old.norm.mean[gone]
+    np.testing.assert_allclose(new.mean_action(x[:, keep[:153]]), old.mean_action(x[:, :189]), atol=1e-6)
+    np.testing.assert_allclose(new.value(new.norm.normalise(x[:, keep])), old.value(old.norm.normalise(x)), rtol=1e-5)
+    moved = x.copy()
+    moved[:, gone] += 1.0
+    assert np.abs(old.mean_action(moved[:, :189]) - old.mean_action(x[:, :189])).max() > 1e-4  # they had mattered
+    np.testing.assert_array_equal(new.log_std, old.log_std)
+
+    _, meta = train(tmp_path / "a", 1, "--init", str(whole), "--sensors", "hmd", "--hidden", "16")
+    assert meta["options"]["sensors"] == "hmd" and meta["policy"]["obs_size"] == 153
+    train(tmp_path / "a", 2, "--resume")
+    train(tmp_path / "b", 1, "--init", str(tmp_path / "a"), "--sensors", "hmd", "--hidden", "16")
+    with pytest.raises(UserError, match="trained with the headset alone: give --sensors hmd"):
+        train(tmp_path / "c", 1, "--init", str(tmp_path / "a"), "--hidden", "16")
+    arrays, meta = load_checkpoint(tmp_path / "a" / CHECKPOINT)
+    save_checkpoint(tmp_path / "p.npz", arrays, meta | {"options": {"sensors": "three"}})
+    with pytest.raises(UserError, match="p.npz: its options have sensors 'three'; valid: full, hmd"):
+        train(tmp_path / "c", 1, "--init", str(tmp_path / "p.npz"), "--sensors", "hmd")
+
+
+def test_switches_reach_the_environment():
+    """Each flag, and the variant of the character, in the environment that is trained."""
+    opt = Options(clips="*stand*", envs=3, threads=1)
+    plain = ppo.make_env(opt)
+    env = ppo.make_env(replace(opt, without=("contact", "action", "asymmetric"), sensors="hmd", scale=0.9))
+    assert {t for t in TERMS if env.char.reward[t][0] == 0} == {"contact", "action_diff", "action_min"}
+    assert (env.devices, env.asymmetric, env.char.variant) == (1, False, {"scale": 0.9})
+    assert (plain.devices, plain.asymmetric, plain.char.variant) == (3, True, {})
+    env = ppo.make_env(replace(opt, track="root"))
+    assert env.char.reward["q"][0] == 0 < env.char.reward["x"][0] and env.ref.link_pos.shape[1] == 1
+    for wrong in (["--without", "contact,gravity"], ["--track", "head"], ["--sensors", "none"]):
+        with pytest.raises(SystemExit):
+            ppo.main(["--out", "nowhere", *wrong])
+
+
+def test_noise_is_the_characters(char, ref):
+    """σ: of the command line, else of the character's [training], else of NOISE; what was used is recorded."""
+    other = replace(char, training={"sigma": 0.06})
+    for c, given, sigma, least in (
+        (char, {}, 0.135, 0.05),
+        (other, {}, 0.06, 0.05),
+        (other, {"sigma": 0.2}, 0.2, 0.05),
+    ):
+        t = trainer_of(c, ref, **given)
+        assert (t.opt.sigma, t.opt.min_sigma) == (sigma, least)
+        np.testing.assert_allclose(t.policy.log_std, np.log(sigma), rtol=1e-6)
+
+
+def test_init_of_another_character(whole, tmp_path, capsys):
+    """What has the same name goes on, whatever its place; the rest is silent; normaliser and σ begin anew."""
+    old, _ = ppo.load_policy(whole)
+    _, meta = train(tmp_path / "dino", 1, "--character", "dino", "--init", str(whole))
+    assert "jesse's policy: 459 of 487 inputs and 33 of 37 torques" in capsys.readouterr().out
+    assert meta["policy"]["action_size"] == 37
+    jesse, dino = character.load("jesse"), character.load("dino")
+    clip = mocap.builtin_clips()[0][:40]
+    a, b = (Env(c, retarget.reference(c, [clip]), 3, threads=1) for c in (jesse, dino))
+    new = ppo.initial_policy(whole, b, 0.07)
+    np.testing.assert_allclose(new.log_std, np.log(0.07), rtol=1e-6)
+    assert new.norm.count == 0
+    names = [envs.input_names(c) for c in (jesse, dino)]
+    assert [len(n) for n in names] == [a.full.shape[1], b.full.shape[1]]
+    x = np.random.default_rng(0).normal(size=(5, len(names[0]))).astype(np.float32)
+    y = np.random.default_rng(1).normal(size=(5, len(names[1]))).astype(np.float32)  # what is new can be anything
+    for i, name in enumerate(names[1]):
+        if name in names[0]:
+            y[:, i] = x[:, names[0].index(name)]
+    had, has = old.actor(x[:, : old.obs_size]), new.actor(y[:, : new.obs_size])
+    for k, h in enumerate(dino.driven):
+        hinge = dino.hinges[h]
+        want = had[:, jesse.hinges.index(hinge)] if hinge in jesse.hinges else 0.0
+        np.testing.assert_allclose(has[:, k], want, atol=1e-5, err_msg=hinge)
+    np.testing.assert_allclose(new.critic(y), old.critic(x), atol=1e-5)
 
 
 def test_policy_round_trip(tmp_path, char, ref):
@@ -654,7 +775,7 @@ def test_fingerprint(char, ref):
 
 
 def test_config_tells_what_was_run(whole):
-    config = ppo.read_config(whole)
+    config = read_config(whole)
     assert config["config"]["clips"] == "*stand*" and config["config"]["data"]["sequences"] == 1
     assert (whole / CONFIG).exists() and {"python", "mujoco"} <= set(config["versions"])
 

@@ -91,6 +91,96 @@ def test_run_main(error, code, capsys):
     assert capsys.readouterr().err == {0: "", 2: "error: bad file\n", 130: "interrupted\n"}[code]
 
 
+def test_user_error_is_one_line():
+    """Line ends of any kind, control characters, and a list of a megabyte: still one line that a terminal can print."""
+    assert str(UserError("a\n b\tc\u2028d\x85e")) == "a b c d e"
+    assert str(UserError("\x1b[2Jgone \x00 \ud800 \u00e9")) == r"\x1b[2Jgone \x00 \ud800 é"
+    said = str(UserError("start " + "x" * 10**6 + " end"))
+    assert len(said) <= runs.MESSAGE and said.startswith("start ") and said.endswith(" end") and " … " in said
+    assert len(str(UserError("\x00" * 10**6))) <= runs.MESSAGE
+
+
+def test_read_text(tmp_path):
+    path = tmp_path / "a.txt"
+    for raw in ("é\r\n".encode(), "é\r\n".encode("utf-8-sig")):
+        path.write_bytes(raw)
+        assert runs.read_text(path, "a text") == "é\r\n"
+    cases = {
+        "é".encode("utf-16"): "a.txt: UTF-16 text; expected a text, in UTF-8",
+        b"one\ntwo \xe9": "a.txt, line 2: byte 0xe9 is not UTF-8; expected a text",
+        b"x" * 11: "a.txt: longer than 10 bytes; expected a text",
+    }
+    for raw, words in cases.items():
+        path.write_bytes(raw)
+        with pytest.raises(UserError, match=words):
+            runs.read_text(path, "a text", limit=10)
+    for odd in (tmp_path, tmp_path / "none", "nul\0"):
+        with pytest.raises(UserError, match="cannot read .*; expected a text"):
+            runs.read_text(odd, "a text")
+
+
+def test_read_toml(tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text("[a]\nb = {c = [1, 2.5]}\n")
+    assert runs.read_toml(path, "a table") == {"a": {"b": {"c": [1, 2.5]}}}
+    bad = {
+        "a = \n": r"no TOML: Invalid value \(at line 1, column 5\)",
+        "a = 1\na = 2": "no TOML: Cannot overwrite a value",
+        "a = " + "[" * 900: "nested more than 16 deep",
+        "a = " + "[" * 30 + "]" * 30: "nested more than 16 deep",
+        ".".join("a" * 20) + " = 1": "nested more than 16 deep",
+        "#" * 2000: "line 1: longer than 1000 characters",
+        "#\n" * 40_000: "longer than 65536 bytes",
+    }
+    for text, words in bad.items():
+        path.write_text(text)
+        with pytest.raises(UserError, match=f"a.toml.*{words}.*; expected a table"):
+            runs.read_toml(path, "a table")
+
+
+def test_parse_json():
+    """What Python's own reader lets through, and no run writes."""
+    whole = {"a": [1, 2.5, None, True, {"b": "é"}], "big": 2**127}
+    assert runs.parse_json(json.dumps(whole)) == whole
+    bad = [
+        "NaN",
+        "[-Infinity]",
+        "1e999",
+        '{"a": 1, "a": 2}',
+        "[" * 100_000,
+        "[" * 20 + "]" * 20,
+        "1" * 61,
+        "",
+        "{",
+        "1 2",
+    ]
+    for text in bad:
+        with pytest.raises(ValueError):
+            runs.parse_json(text)
+    with pytest.raises(ValueError, match="key 'a' is there twice"):
+        runs.parse_json(bad[3])
+
+
+def test_stored_options(tmp_path):
+    """config.json comes back as it was; a value of another kind, or out of range, is told with its place."""
+    runs.open_run(tmp_path, Options())
+    assert Options(**runs.stored_options(Options, tmp_path)) == Options()
+    record = runs.read_config(tmp_path)
+    odd = dict(
+        steps=[0, "7", 1.5, True, None, 2**70], learning_rate=["fast", -1.0, True], hidden=[[], [3, "x"], 5, [0]],
+        character=["bob", 3], resume=[1, "yes"], limit=["none", 0.5], out=[3],
+    )  # fmt: skip
+    for name, values in odd.items():
+        for value in values:
+            (tmp_path / "config.json").write_text(json.dumps({"config": record["config"] | {name: value}}))
+            with pytest.raises(UserError, match=f"config.json: {name} = .* is not valid; it must be "):
+                runs.stored_options(Options, tmp_path)
+    (tmp_path / "config.json").write_text(
+        json.dumps({"config": {"steps": 5, "limit": 3, "learning_rate": 1, "more": []}})
+    )
+    assert runs.stored_options(Options, tmp_path) == {"steps": 5, "limit": 3, "learning_rate": 1}
+
+
 def test_atomic_write(tmp_path):
     path = tmp_path / "a.txt"
     runs.atomic_write(path, "one")
@@ -300,6 +390,8 @@ def test_metrics_resume(tmp_path, capsys):
     metrics = runs.Metrics(path)
     for row in rows[:4]:
         metrics.append(row)
+    with pytest.raises(ValueError, match="loss"):
+        metrics.append({"step": 1, "loss": 2})
     assert metrics.rows == 4 and len(runs.read_metrics(path)["step"]) == 4  # each row is there at once
     with open(path, "a") as file:
         file.write("4,1.3")  # killed in the middle of a row
@@ -311,8 +403,8 @@ def test_metrics_resume(tmp_path, capsys):
     table = runs.read_metrics(path)
     assert list(table) == ["step", "reward", "note, x"] and np.isnan(table["note, x"]).all()
     np.testing.assert_array_equal(table["reward"], [row["reward"] for row in rows])
-    with pytest.raises(ValueError, match="loss"):
-        metrics.append({"step": 1, "loss": 2})
+    with pytest.raises(UserError, match="metrics.csv: the row differs from the header in .*loss"):
+        metrics.append({"step": 1, "loss": 2})  # the header was the file's
     runs.Metrics(path, resume_row=9).close()
     assert "6 of the checkpoint's 9" in capsys.readouterr().err
     runs.Metrics(path, resume_row=0).append({"step": 1, "reward": 2, "note, x": 3})

@@ -12,11 +12,12 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from test_mocap import walk as make_walk
 
+import character
 import mocap
 import play
 import retarget
 import stream
-from env import Env
+from env import Env, headset_only
 from mocap import quat_about, quat_angle, quat_matrix, quat_mul, quat_rotate
 from ppo import Policy
 from runs import UserError, run_main, save_checkpoint
@@ -28,7 +29,7 @@ XYZW = lambda q: np.roll(q, -1, axis=-1)  # noqa: E731
 
 @pytest.fixture(scope="module")
 def jesse():
-    return retarget.character("jesse")
+    return character.load("jesse")
 
 
 @pytest.fixture(scope="module")
@@ -419,17 +420,64 @@ def test_round_trip(jesse, walk, axes):
         assert quat_angle(tick.quat, quat_mul(back, quat[first + k])).max() < 1e-6
 
 
+def test_headset_only(jesse, walk):
+    """§4.2: without controllers' columns, or with ones that are not read: the headset's ticks, hands hanging."""
+    pos, quat = mocap.sensors(walk)
+    times = np.arange(len(pos)) / 30
+    lines = to_csv(times, pos, quat)
+    headset = [",".join(line.strip().split(",")[:8]) + "\n" for line in lines]
+    with pytest.raises(UserError, match="no column left_px, .* and 10 more"):
+        list(Reader("x").read(headset))
+    with pytest.raises(UserError, match="no column head_qw"):
+        list(Reader("x", devices=1).read([",".join(line.split(",")[:7]) + "\n" for line in headset]))
+    found = []
+    for text in (headset, lines):
+        source = Stream(jesse, "mujoco", devices=1)
+        ticks = [tick for s in Reader("x", devices=1).read(text) for tick in source.push(s)]
+        assert len(ticks) > 100 and len(source.report()) == 1  # the calibration; no device is missed
+        found.append(ticks)
+    whole = Stream(jesse, "mujoco")
+    for a, b, c in zip(*found, [t for s in Reader("x").read(lines) for t in whole.push(s)], strict=True):
+        np.testing.assert_array_equal(a.pos, b.pos)
+        np.testing.assert_allclose(a.pos[0], c.pos[0])
+        turn = quat_about(2, mocap.heading(a.quat[0]))
+        offset = quat_rotate(mocap.quat_conj(turn), a.pos[1:] - a.pos[0]) / source.calibration.scale
+        np.testing.assert_allclose(offset, NEUTRAL[1:], atol=1e-9)
+        assert quat_angle(a.quat[1:], turn).max() < 1e-6
+    player = Player(jesse, lambda obs: np.zeros((1, len(jesse.limits))), devices=1)
+    player.step(a.pos, a.quat)
+    assert "hand" not in " ".join(player.report()) and player.obs.shape == (1, 189 - 36)
+
+
+def test_controllers_hang(jesse, walk):
+    """For a recorded motion the same as a stream whose controllers are never seen, in the character's size."""
+    ref = retarget.reference(jesse, [walk])
+    hang = stream.controllers_hang(ref)
+    pos, quat = mocap.sensors(walk)
+    lost = [Sample(k / 30, *(np.where(np.arange(3)[:, None], np.nan, v[k]) for v in (pos, quat))) for k in range(60)]
+    out, guard = guarded(lost)
+    assert guard.events["left", "not finite"] == 1
+    for k, sample in enumerate(out):
+        np.testing.assert_allclose(hang.sensor_pos[k], sample.pos * ref.scale[k], atol=1e-6)
+        assert quat_angle(hang.sensor_quat[k], sample.quat).max() < 1e-6
+    np.testing.assert_array_equal(hang.sensor_pos[:, 0], ref.sensor_pos[:, 0])
+    np.testing.assert_array_equal(hang.sensor_rot[:, 0], ref.sensor_rot[:, 0])
+    np.testing.assert_allclose(hang.sensor_rot, quat_matrix(hang.sensor_quat)[..., :2], atol=1e-6)
+    assert np.abs(ref.sensor_pos[:, 1:] - hang.sensor_pos[:, 1:]).max() > 0.05  # the argument is as it was
+
+
 # ------------------------------------------------------------------------------------ the character
 
 
-def test_player_observes_as_env(jesse, walk):
+@pytest.mark.parametrize("devices", [3, 1])
+def test_player_observes_as_env(jesse, walk, devices):
     """From one state, with one user, Player and Env see and do the same for a second."""
     ref = retarget.reference(jesse, [walk])
-    env = Env(jesse, ref, 1, threads=1, autoreset=False)
+    env = Env(jesse, ref if devices == 3 else headset_only(ref), 1, threads=1, autoreset=False)
     env.reset(frames=[10])
     act = lambda obs: 0.3 * np.sin(np.arange(len(jesse.limits)) + 5 * obs[:, :1])  # noqa: E731
-    player = Player(jesse, act)
-    player.before = (ref.sensor_pos[9][None], ref.sensor_rot[9][None])
+    player = Player(jesse, act, devices=devices)
+    player.before = (ref.sensor_pos[9][None, :devices], ref.sensor_rot[9][None, :devices])
     player.qpos[:], player.qvel[:] = env.qpos, env.qvel
     player.batch.forward(np.arange(1), retarget.STAGE_VEL)
     for k in range(30):
@@ -453,7 +501,7 @@ def test_stand(jesse):
     site = player.site_xpos[0, jesse.sensor_sites[0]]
     assert np.allclose(site[:2], pos[0, :2], atol=1e-9) and np.isclose(site[2], stream.headset(jesse)[2])
     assert np.isclose(mocap.heading(player.qpos[0, 3:7]), 0.8) and not player.qvel.any()
-    lowest = retarget.geom_lowest(jesse.model, jesse.sole_geoms.ravel(), player.geom_xpos, player.geom_xmat).min()
+    lowest = character.geom_lowest(jesse.model, jesse.sole_geoms.ravel(), player.geom_xpos, player.geom_xmat).min()
     assert abs(lowest) < 1e-6
     player.before = (pos[None] - [0.01, 0.02, 0.5], None)
     player.stand(pos, np.tile(turn, (3, 1)))
@@ -468,6 +516,7 @@ def test_falls_are_counted(jesse):
         player.step(*still)
     assert player.ends["fall"] >= 1 and np.isfinite(player.qpos).all()
     assert "falls" in player.report()[0] and "head error" in player.report()[1] and "p99" in player.report()[2]
+    player.stand(*still)
     before = player.ends["away"]
     assert player.step(still[0] + [3.0, 0, 0], still[1]) == "away" and player.ends["away"] == before + 1
     assert np.linalg.norm(player.qpos[0, :2] - [3.0, 0]) < 0.2
