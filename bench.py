@@ -4,6 +4,7 @@ r"""How fast it is: every part of training beside the physics it cannot beat, in
     python bench.py --character jesse --json OUT     characters.NAME.{physics, environment, inference, update, ...}
     python bench.py --scaling                        1 and all threads, 64 to 4,096 environments
     python bench.py --physics                        what other steps, solvers and iterations would cost and spoil
+    python bench.py --drop --json OUT                DROP's simulator: drop.{fps, fps_pushed, samples, characters}
 
 physics       bare `mujoco.rollout` of the same model and substeps, from the same states
 environment   `Env.step`: physics, refresh, reward, termination, reset, observation
@@ -30,27 +31,30 @@ import numpy as np
 from mujoco import rollout
 
 import character
+import drop
+import drop_demos
 import mocap
 import ppo
 import retarget
 from character import geom_lowest
 from env import BAD, SUBSTEPS, Env
 from nn import gaussian_logp
-from runs import NONNEGATIVE, POSITIVE, arg, atomic_write, cli, run_main, versions
+from runs import COUNT, POSITIVE, THREADS, arg, atomic_write, cli, run_main, versions
 
 
 @dataclass
-class Options:
+class Options(character.Switches):
     """What to time, and how often."""
 
     character: str | None = arg(None, "one character; all of them by default")
     motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names")
-    envs: int = arg(512, "characters simulated side by side", check=POSITIVE)
-    threads: int = arg(0, "physics threads, 0 = all cores", check=NONNEGATIVE)
+    envs: int = arg(512, "characters simulated side by side", check=COUNT)
+    threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
     rounds: int = arg(7, "how often each part is timed", check=POSITIVE)
     scaling: bool = arg(False, "also the table over threads and environments")
     physics: bool = arg(False, "the table over physics steps, solvers and iterations instead")
+    drop: bool = arg(False, "frames a second of DROP's simulator instead, against samples and characters")
     json: str | None = arg(None, "write the figures here")
 
 
@@ -185,6 +189,35 @@ def physics_table(char, ref, act, envs=256, seconds=1.0, seed=0, threads=0) -> l
     return rows
 
 
+def bench_drop(frames=60, rounds=7) -> dict:
+    r"""DROP's frames a second on one core: default prior, soft correction, energies and contact forces computed.
+
+    Method    CPU time of the process (run it with OMP_NUM_THREADS=1), median of rounds of 2 s of walking
+    Returns   fps; fps_pushed : the same, pushed sideways all the time, so that most steps are corrected;
+              samples : {n: fps}; characters : {k: frames a second of the scene}
+    Test      tests/test_bench.py::test_bench_drop
+    """
+    stage = drop_demos.Stage(drop_demos.Options())
+    rng = np.random.default_rng(0)
+
+    def rate(characters=1, newton=0.0, **settings):
+        sim, first = stage.start(1.2, **settings)
+        force = np.zeros((drop.N, 3))
+        force[drop.J["spine3"], 1] = newton
+        times = []
+        for _ in range(rounds + 1):  # the first round fills the cache of factorised matrices
+            states, t = [first] * characters, time.process_time()
+            for _ in range(frames):
+                states = [sim.step(s, force, rng=rng)[0] for s in states]
+            times.append((time.process_time() - t) / frames)
+        return float(1.0 / np.median(times[1:]))
+
+    out = {"fps": rate(), "fps_pushed": rate(newton=70.0)}
+    out["samples"] = {n: rate(samples=n) for n in (1, 4, 64, 256)}
+    out["characters"] = {k: rate(characters=k) for k in (2, 4, 8)}
+    return out
+
+
 def _seconds(f, repeats):
     t = time.perf_counter()
     for _ in range(repeats):
@@ -195,13 +228,18 @@ def _seconds(f, repeats):
 def main(argv=None):
     """Print the table of every character.  Test: tests/test_bench.py::test_bench_json"""
     opt = cli(Options, argv, "bench.py", __doc__)
-    names = [opt.character] if opt.character else character.available()
+    names = [] if opt.drop else [opt.character] if opt.character else character.available()
     print(
         f"{os.cpu_count()} cores, " + ", ".join(f"{k} {v}" for k, v in versions().items() if k in ("numpy", "mujoco"))
     )
-    results = {}
+    results, more = {}, {}
+    if opt.drop:
+        more["drop"] = r = bench_drop(rounds=opt.rounds)
+        print(f"\nDROP, one character, one core: {r['fps']:.0f} frames/s; {r['fps_pushed']:.0f} while it is pushed")
+        print("  samples     " + "   ".join(f"{n}: {v:.0f}" for n, v in r["samples"].items()))
+        print("  characters  " + "   ".join(f"{k}: {v:.0f}" for k, v in r["characters"].items()))
     for name in names:
-        char = character.load(name)
+        char = replace(opt, character=name).load()
         ref = retarget.reference(char, mocap.sequences(opt.motion, "train", opt.clips))
         if opt.physics:
             policy, _ = ppo.load_policy(character.CHARACTERS / f"{name}.npz")
@@ -231,7 +269,7 @@ def main(argv=None):
                         f"  {threads:7d} {envs:5d} {s['physics']:9,.0f} {s['train']:9,.0f} {s['train_of_physics']:9.2f}"
                     )
     if opt.json:
-        atomic_write(opt.json, json.dumps({"characters": results, "versions": versions()}, indent=2) + "\n")
+        atomic_write(opt.json, json.dumps({"characters": results, **more, "versions": versions()}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

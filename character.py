@@ -271,7 +271,7 @@ class _Loader:
     )
     TABLES = tuple(t for t in KEYS if t not in ("pose", "metrics", "training"))  # those that must be there
     PARTS = (
-        "tables", "compile", "skeleton", "default_pose", "motors", "torques", "springs", "root", "chains", "feet",
+        "compile", "skeleton", "default_pose", "motors", "torques", "springs", "root", "chains", "feet",
         "rest", "links", "link_weights", "joint_weights", "rewards", "sites", "fall", "metrics",
     )  # fmt: skip
     SHAPES = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
@@ -285,6 +285,7 @@ class _Loader:
         with suppress(_Stop):
             if spec is None:
                 self.spec = self.read()
+            self.tables()
             self.xml = self.find_xml()
 
     def load(self) -> Character | None:
@@ -429,9 +430,10 @@ class _Loader:
             for key in value if self.KEYS.get(name) and isinstance(value, dict) else ():
                 if key not in self.KEYS[name]:
                     self.complain(f"[{name}] has {key!r}, which means nothing; valid: {', '.join(self.KEYS[name])}")
-        for key, value in self.table("training").items():
-            if self.number(f"[training] {key}", value) <= 0:
-                self.complain(f"[training] {key} = {value!r} must be greater than 0")
+        with suppress(_Stop):
+            for key, value in self.table("training").items():
+                if self.number(f"[training] {key}", value) <= 0:
+                    self.complain(f"[training] {key} = {value!r} must be greater than 0")
 
     def mjspec(self, visual=True) -> mujoco.MjSpec:
         """The MJCF with the variations; without the shapes that are only looked at, which cost time in every step."""
@@ -502,11 +504,17 @@ class _Loader:
 
     def compile(self):
         spec = self.mjspec(visual=False)
+        for body in spec.bodies:
+            hinges = [j for j in body.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE]
+            axes = "".join("xyz"[np.argmax(np.abs(j.axis))] for j in hinges)
+            if len(set(axes)) != len(axes):
+                self.fail_xml(f"body {body.name} has two hinges about one axis ({axes})")
         try:
-            m = spec.compile()
-        except (ValueError, RuntimeError, MemoryError) as e:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                m = spec.compile()
+        except (ValueError, RuntimeError, MemoryError, Warning) as e:
             self.fail_xml(f"{e}; expected MJCF that MuJoCo can compile")
-
         for name in "body_pos body_ipos body_mass body_inertia geom_pos geom_size jnt_pos site_pos".split():
             if not np.all(np.abs(getattr(m, name)) <= LIMIT):
                 self.fail_xml(f"its {name} holds NaN, or more than {LIMIT:g}; expected SI units")
@@ -653,8 +661,6 @@ class _Loader:
                 if b == m.jnt_bodyid[0] or not len(hinges):
                     self.fail(f"[map] body {body} has no hinge in {self.xml.name}")
                 axes = "".join("xyz"[np.argmax(np.abs(m.jnt_axis[1 + h]))] for h in hinges)
-                if len(set(axes)) != len(axes):
-                    self.fail_xml(f"body {body} has two hinges about one axis ({axes})")
                 shares = {a: self.number(f"[map] {body}.{a}", entry[a]) for a in "xyz" if a in entry}
                 if set(shares) - set(axes):
                     extra = ", ".join(sorted(set(shares) - set(axes)))
@@ -665,7 +671,7 @@ class _Loader:
         if len(out) < len(table):
             raise _Stop
         if "head" not in followers:
-            self.fail("[map] has no body that follows the human's head")
+            self.fail("[map] has no body that follows the human's head; needed: one with to = 'head'")
         return dict(chains=sorted(out, key=lambda c: c[0]), mapped=mapped, head=followers["head"])
 
     def feet(self):

@@ -6,9 +6,12 @@ r"""Run a policy: measure it, look at it, record it  [Reda23 §4].
     python play.py --character jesse --motion FOLDER --view | --view web        MuJoCo's viewer: window or browser
     python play.py --character jesse --stream FILE.csv | --stream -             a headset's recording, or a live one
     python play.py --character jesse --motion FOLDER --measure --push 400@2     the largest push survived
+    python play.py --compare A B … --motion FOLDER [--json OUT] [--png OUT]     policies beside one another
 
 Rows of the table: `policy` (its mean action), `kinematic` (the retargeted pose itself), `zero` (no torque) and `pd`
 (open-loop PD tracking of the reference).  Targets and labels are the human's for all rows.
+
+A policy's file says which character it was trained for, with which variation, and whether it saw controllers.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import contextlib
 import json
 import re
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -29,26 +32,32 @@ import mocap
 import retarget
 import stream
 from character import Character
-from env import EPISODE_STEPS, Env
-from mocap import heading, quat_angle, quat_conj, quat_mul, quat_rotate
-from ppo import check_fits, load_policy
+from env import EPISODE_STEPS, SENSORS, Env, headset_only
+from metrics import Recording, as_json, comparison, measure, table
+from mocap import heading
+from ppo import check_fits, load_policy, sensors_of, trained_as
 from retarget import Reference, forward_kinematics, sole_motion
 from rigs import HELP, Reading
-from runs import NONNEGATIVE, POSITIVE, UserError, arg, atomic_write, cli, run_main
+from runs import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, atomic_write, cli, fmt_count, run_main
 from stream import AXES, SAMPLE_RATE
 
 
 @dataclass
-class Options:
+class Options(character.Switches):
     """Which policy, on which motion, and what to make of it."""
 
-    character: str = arg("jesse", "name in characters/, or path of a .toml")
+    character: str | None = arg(None, "name in characters/, or path of a .toml; the policy's own by default, or jesse")
     motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names")
     joint_map: str | None = arg(None, HELP["joint_map"])
     unit: str | None = arg(None, HELP["unit"])
     up: str | None = arg(None, HELP["up"])
     policy: str | None = arg(None, "run folder or policy .npz; characters/NAME.npz by default")
+    compare: tuple[str, ...] = arg((), "several of them: a table, and with --png a figure", metavar="A B …")
+    sensors: str | None = arg(
+        None, "what the policy is shown of the user: by default what it was trained with; hmd [§4.2] for one that was "
+        "trained with controllers: they hang beside the body, wherever the user's are", choices=SENSORS,
+    )  # fmt: skip
     measure: bool = arg(False, "print every metric for policy, kinematic, zero and pd")
     json: str | None = arg(None, "write the measured table here")
     all: bool = arg(False, "every sequence of the motion, not only its validation part")
@@ -63,7 +72,9 @@ class Options:
     )
     sequence: int = arg(0, "which sequence to show", check=NONNEGATIVE)
     seconds: float | None = arg(None, "how much of it to show: 10 s by default, all of a stream", check=POSITIVE)
-    every: float = arg(0.5, "seconds between the pictures of the contact sheet", check=POSITIVE)
+    every: float | None = arg(
+        None, "seconds between the pictures of the contact sheet: 0.5; with --compare eight pictures", check=POSITIVE
+    )
     png: str | None = arg(None, "write a contact sheet")
     video: str | None = arg(None, "write a video (.mp4; needs the extra `view`)")
     bvh: str | None = arg(None, "write what the character did, until it failed or the episode ended, as BVH")
@@ -87,7 +98,7 @@ class Options:
         "right; with --measure: the largest push survived at T s, up to N, to all four",
     )
     seed: int = arg(0, "seed of stitching and random starts", check=NONNEGATIVE)
-    threads: int = arg(0, "physics threads, 0 = all cores", check=NONNEGATIVE)
+    threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
 
 
 # ------------------------------------------------------------------------------------ what drives the character
@@ -214,23 +225,6 @@ def push_report(found: dict, push: Push) -> str:
 # ------------------------------------------------------------------------------------ running
 
 
-@dataclass
-class Recording:
-    """What a character did on one sequence.
-
-    frames : (T,) reference frames, the start included; qpos (T, nq); contact (T, 2) bool, the human's at the start;
-    action (T, u), of the step that led to the frame (zero at the start); failed : bool; available : steps the
-    sequence had to offer
-    """
-
-    frames: np.ndarray
-    qpos: np.ndarray
-    contact: np.ndarray
-    action: np.ndarray
-    failed: bool
-    available: int
-
-
 def simulate(
     char: Character, ref: Reference, act, horizon=EPISODE_STEPS, threads=0, only=None, push: Push | None = None
 ) -> list[Recording]:
@@ -296,177 +290,121 @@ def time_to_failure(char, ref, act, n=256, seconds=20.0, seed=0, threads=0) -> f
     return n * steps * env.dt / failures if failures else float("inf")
 
 
-# ------------------------------------------------------------------------------------ metrics: one function each
+# ------------------------------------------------------------------------------------ measuring
 
 
-def distance(a, b):
-    """Mean Euclidean distance.  (..., 3) -> float"""
-    return float(np.linalg.norm(a - b, axis=-1).mean())
+def measure_all(char, ref, policy, opt: Options, seen: Reference | None = None) -> dict:
+    """The four rows.  seen : what the policy is shown, if not ref  Test: tests/test_play.py::test_measure_json"""
+    actions = {"policy": policy_action(policy), "kinematic": None, "zero": zero_action, "pd": pd_action}
+    return {k: measure_one(k, char, ref, act, opt, seen if k == "policy" else None) for k, act in actions.items()}
 
 
-def jitter(x, rate):
-    r"""Mean over joints and frames of ‖x_{t+3} − 3x_{t+2} + 3x_{t+1} − x_t‖ / dt³.  x (T, J, 3) -> sum, count.
+def measure_one(name, char, ref, act, opt: Options, seen: Reference | None = None) -> dict:
+    """One row: of what `act` does, which is shown `seen`; of the kinematic pose without it.  The targets are ref's.
 
-    Test      tests/test_play.py::test_metrics_on_known_motion
-    """
-    d = np.linalg.norm(np.diff(x, n=3, axis=0), axis=-1) * rate**3
-    return d.sum(), d.size
-
-
-def footfalls(contact):
-    """How often a foot begins to touch.  contact (T, 2) bool -> int"""
-    return int(np.sum(contact[1:] & ~contact[:-1]))
+    Test      tests/test_play.py::test_measure_json, test_headset_only"""
+    print(f"measuring {name}: {len(ref.names)} sequences", file=sys.stderr, flush=True)
+    seen = seen or ref
+    row = measure(char, ref, simulate(char, seen, act, threads=opt.threads) if act else kinematic(char, ref))
+    if act and opt.random_starts:
+        row["fails_every_s"] = time_to_failure(char, seen, act, opt.random_starts, seed=opt.seed, threads=opt.threads)
+    return row
 
 
-def travelled(root):
-    """Length of the root's path on the floor [m].  (T, 3) -> float"""
-    return float(np.linalg.norm(np.diff(root[:, :2], axis=0), axis=-1).sum())
+# ------------------------------------------------------------------------------------ comparing
+
+PICTURES = 8  # a row of the figure, unless --every says otherwise
 
 
-def local_rotations(quat, parents):
-    """Rotation of each body in its parent.  quat (T, b, 4), parents (b,) -> (T, b, 4)"""
-    return quat_mul(quat_conj(quat[:, parents]), quat)
+@dataclass
+class Arm:
+    """One of the policies that are compared.  ref : its targets; seen : what it is shown of the user"""
+
+    path: str
+    policy: object
+    meta: dict
+    char: Character
+    ref: Reference
+    seen: Reference
+
+    def title(self) -> str:
+        """What it is, in a line.  Test: tests/test_play.py::test_compare"""
+        options, parts = self.meta.get("options", {}), [name_of(self.char)]
+        parts += [f"{fmt_count(self.meta['steps'])} steps"] if isinstance(self.meta.get("steps"), int) else []
+        parts += [f"without {' '.join(map(str, options['without']))}"] if options.get("without") else []
+        parts += ["root tracked only"] if options.get("track") == "root" else []
+        if sensors_of(self.meta, self.path) == "hmd":
+            parts.append("headset only")
+        elif self.seen is not self.ref:
+            parts.append("controllers hang")
+        return f"{self.path}: {', '.join(parts)}"
 
 
-def head_rates(quat, rate):
-    """Roll and yaw velocity of the head about its own axes.  (T, 4) -> (T, 2) [rad/s]"""
-    return quat_rotate(quat_conj(quat), mocap.angular_velocity(quat, rate))[:, [0, 2]]
+def name_of(char: Character) -> str:
+    """A character's name and variation.  Test: tests/test_play.py::test_compare"""
+    text = lambda v: "; ".join(v) if isinstance(v, list) else v  # noqa: E731
+    return " ".join([char.name, *(f"{k} {text(v)}" for k, v in char.variant.items())])
 
 
-def sip_bodies(char: Character):
-    """Upper arms and thighs, from the TOML's [metrics] table.  Test: tests/test_play.py::test_sip_bodies"""
-    m, names = char.model, char.spec.get("metrics", {}).get("sip", [])
-    found = [mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, str(n)) for n in names]
-    if not found or min(found) < 0:
-        valid = ", ".join(m.body(b).name for b in range(1, m.nbody))
-        raise UserError(f"{char.path}: [metrics] sip = {names} must name upper arms and thighs; bodies: {valid}")
-    return np.array(found)
+def arms_of(clips, opt: Options) -> list[Arm]:
+    """The policies of --compare, each with its own character, all checked before anything is simulated.
+
+    Test      tests/test_play.py::test_compare"""
+    arms, own = [], replace(opt, character=None)
+    for path in opt.compare:
+        policy, meta = load_policy(path)
+        char = load_character(own, meta, path)
+        ref = retarget.reference(char, clips)
+        arms.append(Arm(path, policy, meta, char, ref, shown_to(meta, path, ref, opt.sensors)))
+        check_fits(policy, Env(char, arms[-1].seen, 1), path)
+    return arms
 
 
-def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dict:
-    """Every metric of spec/metrics over recordings, pooled over their frames.
+def compare(arms: list[Arm], opt: Options) -> dict:
+    """A row for every policy, on the same sequences, and one for every character's kinematic pose.
 
-    Frames lived count equally, whichever clip they are in; `completed` and `survival` say how many were lived.
-    Joints are the bodies of the joint map; for positions and jitter the hands too.  The human's own figures are taken
-    before the scaling.  Contact and action are measured after steps, so not at the start.
-    Returns   key -> number; NaN where there was nothing to measure (no frame, no step, no metre travelled)
-    Test      tests/test_play.py::test_metrics_against_slow_loop, test_metrics_of_kinematic,
-              test_metrics_on_known_motion, test_nothing_to_measure
-    """
-    m, rate = char.model, ref.rate
-    bodies = np.array(sorted({b for b, *_ in char.chains}))
-    joints = np.union1d(bodies, m.site_bodyid[char.sensor_sites])
-    parents = m.body_parentid
-    sip = sip_bodies(char)
-    rows, sums = [], {}
-    add = lambda key, total, count: sums.__setitem__(key, np.add(sums.get(key, (0.0, 0)), (total, count)))  # noqa: E731
-    mean_over = lambda key, values: add(key, float(np.sum(values)), np.size(values))  # noqa: E731
-    for rec in recordings:
-        f = rec.frames
-        sim, kin = forward_kinematics(char, rec.qpos), forward_kinematics(char, ref.qpos[f])
-        rows.append((not rec.failed, (len(f) - 1) / rec.available if rec.available else 1.0))
-        mean_over("root_cm", 100 * np.linalg.norm(rec.qpos[:, :3] - ref.qpos[f, :3], axis=-1))
-        sites = 100 * np.linalg.norm(sim.site_xpos - ref.sensor_pos[f], axis=-1)
-        mean_over("head_cm", sites[:, 0])
-        mean_over("hands_cm", sites[:, 1:])
-        aligned = lambda k: k.xpos[:, joints] - k.xpos[:, char.root, None]  # noqa: E731
-        mean_over("joint_pos_cm", 100 * np.linalg.norm(aligned(sim) - aligned(kin), axis=-1))
-        mean_over("head_deg", np.degrees(quat_angle(sim.xquat[:, char.head], ref.orientation[f, 1])))
-        local = [local_rotations(k.xquat, parents)[:, bodies] for k in (sim, kin)]
-        mean_over("joint_rot_deg", np.degrees(quat_angle(*local)))
-        mean_over("sip_deg", np.degrees(quat_angle(sim.xquat[:, sip], kin.xquat[:, sip])))
-        _, speed = sole_motion(sim.soles, rate)
-        mean_over("foot_slide_cm_s", 100 * speed[ref.contact[f]] if len(f) > 1 else [])
-        mean_over("penetration_mm", -1000 * sim.lowest[sim.lowest < 0])
-        mean_over("contact_agreement", rec.contact[1:] == ref.contact[f[1:]])
-        add("jitter_m_s3", *jitter(sim.xpos[:, joints], rate))
-        human = ref.human_pos[f].astype(float) / ref.scale[f, None]
-        add("human_jitter_m_s3", *jitter(human, rate))
-        add("steps_per_m", footfalls(rec.contact), travelled(rec.qpos))
-        add("human_steps_per_m", footfalls(ref.contact[f]), travelled(human[:, 0]))
-        wobble = head_rates(sim.xquat[:, char.head], rate) - head_rates(ref.orientation[f, 1], rate)
-        mean_over("head_wobble_deg_s", np.degrees(wobble) ** 2 if len(f) > 2 else [])
-        mean_over("torque_rms", rec.action[1:] ** 2)
-        mean_over("saturation", np.abs(rec.action[1:]) > 0.99)
-    out = {
-        "clips": len(recordings),
-        "completed": float(np.mean([r[0] for r in rows])),
-        "survival": float(np.mean([r[1] for r in rows])),
-    }
-    out |= {k: float(total / count) if count else float("nan") for k, (total, count) in sums.items()}
-    out["penetration_mm"] = float(np.nan_to_num(out["penetration_mm"]))  # 0: never below the floor
-    for key in ("head_wobble_deg_s", "torque_rms"):
-        out[key] = float(np.sqrt(out[key]))
+    Test      tests/test_play.py::test_compare"""
+    out = {a.path: measure_one(a.path, a.char, a.ref, policy_action(a.policy), opt, a.seen) for a in arms}
+    several = {name_of(a.char): a for a in arms}
+    for name, a in several.items():
+        label = f"kinematic {name}" if len(several) > 1 else "kinematic"
+        out[label] = measure_one(label, a.char, a.ref, None, opt)
     return out
 
 
-COLUMNS = (  # key, heading, format
-    ("completed", "completed", "{:.2f}"),
-    ("survival", "survival", "{:.2f}"),
-    ("fails_every_s", "fails every s", "{:.2f}"),
-    ("root_cm", "root cm", "{:.1f}"),
-    ("head_cm", "head cm", "{:.1f}"),
-    ("hands_cm", "hands cm", "{:.1f}"),
-    ("joint_pos_cm", "joints cm", "{:.1f}"),
-    ("head_deg", "head °", "{:.1f}"),
-    ("joint_rot_deg", "joints °", "{:.1f}"),
-    ("sip_deg", "SIP °", "{:.1f}"),
-    ("foot_slide_cm_s", "slide cm/s", "{:.1f}"),
-    ("penetration_mm", "below mm", "{:.1f}"),
-    ("contact_agreement", "contact", "{:.2f}"),
-    ("jitter_m_s3", "jitter m/s³", "{:.0f}"),
-    ("steps_per_m", "steps/m", "{:.2f}"),
-    ("head_wobble_deg_s", "wobble °/s", "{:.0f}"),
-    ("torque_rms", "torque rms", "{:.2f}"),
-    ("saturation", "saturation", "{:.3f}"),
-)
+def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320)):
+    """One picture: the human beside the first character's kinematic pose, then a row for every policy.
 
-
-def table(results: dict) -> str:
-    """The rows as Markdown; a dash where there is nothing to measure.
-
-    The kinematic row completes by definition and has no torque: printed as a dash too.
-    Test      tests/test_play.py::test_table
+    All at the same moments of one sequence; where a policy had failed its row is empty.  The camera follows.
+    Test      tests/test_play.py::test_comparison_sheet
     """
-    lines = ["| | " + " | ".join(h for _, h, _ in COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
-    for name, row in results.items():
-        dash = {"completed", "survival", "fails_every_s", "torque_rms", "saturation"} if name == "kinematic" else set()
-        cells = ["-" if k in dash else cell(row.get(k, np.nan), fmt) for k, _, fmt in COLUMNS]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    human = results.get("kinematic", row)  # the kinematic row has every frame
-    jitter, pace = cell(human["human_jitter_m_s3"], "{:.0f}"), cell(human["human_steps_per_m"], "{:.2f}")
-    lines.append(f"\nthe human: jitter {jitter} m/s³, {pace} steps/m; {human['clips']} sequences")
-    return "\n".join(lines)
+    import render
 
-
-def cell(value, fmt):
-    """A number as text: a dash for NaN, `never` for infinity."""
-    return "-" if np.isnan(value) else "never" if value == np.inf else fmt.format(value)
-
-
-def as_json(results: dict) -> str:
-    """The same rows as JSON; null for NaN (nothing to measure) and infinity (never failed).
-
-    Test      tests/test_play.py::test_measure_json
-    """
-    clean = {name: {k: v if np.isfinite(v) else None for k, v in row.items()} for name, row in results.items()}
-    return json.dumps(clean, indent=2, allow_nan=False) + "\n"
-
-
-def measure_all(char, ref, policy, opt: Options) -> dict:
-    """The four rows.  Test: tests/test_play.py::test_measure_json"""
-    actions = {"policy": policy_action(policy)} if policy else {}
-    actions |= {"kinematic": None, "zero": zero_action, "pd": pd_action}
-    out = {}
-    for name, act in actions.items():
-        print(f"measuring {name}: {len(ref.names)} sequences", file=sys.stderr, flush=True)
-        recordings = simulate(char, ref, act, threads=opt.threads) if act else kinematic(char, ref)
-        out[name] = measure(char, ref, recordings)
-        if act and opt.random_starts:
-            out[name]["fails_every_s"] = time_to_failure(
-                char, ref, act, opt.random_starts, seed=opt.seed, threads=opt.threads
-            )
-    return out
+    rate, first = arms[0].ref.rate, int(arms[0].ref.first[opt.sequence])
+    last = min(len(clip) - 1, EPISODE_STEPS, round((opt.seconds or 10.0) * rate))
+    step = max(1, round(opt.every * rate)) if opt.every else max(1, last / (PICTURES - 1))
+    frames = np.unique(np.arange(0, last + 1, step).round().astype(int))
+    times = [f"{t / rate:.1f} s" for t in frames]
+    pose = SimpleNamespace(qpos=arms[0].ref.qpos[first:])
+    wide, beside = mujoco.MjvCamera(), np.array([0.0, 0.8, 0.0])  # both in the picture, whichever way they turn
+    wide.type, wide.trackbodyid, wide.distance = mujoco.mjtCamera.mjCAMERA_TRACKING, arms[0].char.root, 3.5
+    wide.azimuth, wide.elevation = 205, -8
+    human = retarget.draw(arms[0].char, clip, pose, frames, size, wide, beside)
+    rows = [(f"human and kinematic {name_of(arms[0].char)}: {clip.name}", human, times)]
+    for a in arms:
+        act = policy_action(a.policy)
+        recording = simulate(a.char, a.seen, act, threads=opt.threads, only=[opt.sequence])[0]
+        lived = [t for t in frames if t < len(recording.frames)]
+        gone = len(frames) - len(lived)
+        images = pictures(a.char, a.seen, recording, lived, size)
+        images += [np.full_like(images[0], 255)] * gone
+        end = f"failed at {(len(recording.frames) - 1) / rate:.1f} s"
+        rows.append((a.title(), images, times[: len(lived)] + [end] * gone))
+    sheets = []
+    for title, images, labels in rows:
+        sheet = render.contact_sheet(images, labels, len(images))
+        sheets += [render.label_image(np.full((20, sheet.shape[1], 3), 120, np.uint8), title), sheet]
+    return np.vstack(sheets)
 
 
 # ------------------------------------------------------------------------------------ looking
@@ -606,20 +544,22 @@ def _open_viewer(model, data, root, how, port):
 PICTURED = 600.0  # s of a stream that pictures are kept of, at most
 
 
-def play_stream(char: Character, policy, path, opt: Options) -> None:
+def play_stream(char: Character, policy, path, devices: int, opt: Options) -> None:
     """Drive the character with a recorded or live headset; print what happened.
 
+    Args      devices : what the policy was trained with; of 3, two hang beside the body with --sensors hmd
     Raises    UserError: the stream cannot be read, or shows no headset for a second
     Test      tests/test_stream.py::test_command_line, test_stdin, test_web_view
     """
     live = opt.stream == "-"
     push = parse_push(opt.push)
-    player = stream.Player(char, policy.mean_action, force=push.force if push else None)
+    read = 1 if opt.sensors == "hmd" else devices
+    player = stream.Player(char, policy.mean_action, force=push.force if push else None, devices=devices)
     check_fits(policy, player, path)
     source = stream.Stream(
-        char, opt.axes, sample_rate=opt.sample_rate, grip=opt.grip, user_height=opt.user_height
+        char, opt.axes, sample_rate=opt.sample_rate, grip=opt.grip, user_height=opt.user_height, devices=read
     )  # fmt: skip
-    reader = stream.Reader("standard input" if live else opt.stream, strict=not live)
+    reader = stream.Reader("standard input" if live else opt.stream, strict=not live, devices=read)
     samples = reader.read(stream.lines_of(opt.stream))
     pace = stream.Pace(player.dt) if opt.realtime or opt.view else None
     if live and pace:
@@ -629,16 +569,18 @@ def play_stream(char: Character, policy, path, opt: Options) -> None:
     with contextlib.ExitStack() as stack:
         handle = None
         if opt.view:
-            rest = SimpleNamespace(sensor_pos=np.zeros((1, 3, 3)), sensor_quat=np.tile(np.eye(1, 4), (1, 3, 1)))
+            none = np.zeros((1, devices, 3)), np.tile(np.eye(1, 4), (1, devices, 1))
+            rest = SimpleNamespace(sensor_pos=none[0], sensor_quat=none[1])
             shown = _shown_model(char, rest)
             data = mujoco.MjData(shown)
             handle = stack.enter_context(_open_viewer(shown, data, char.root, opt.view, opt.port))
 
         def see(player, tick):
+            pos, quat = tick.pos[:devices], tick.quat[:devices]
             if len(seen) < keep:
-                seen.append((player.qpos[0].copy(), tick.pos, tick.quat))
+                seen.append((player.qpos[0].copy(), pos, quat))
             if handle:
-                data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = player.qpos[0], tick.pos, tick.quat
+                data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = player.qpos[0], pos, quat
                 data.time += player.dt
                 mujoco.mj_forward(shown, data)
                 handle.sync()
@@ -664,7 +606,7 @@ def _write_pictures(char, ref, recording, last, opt):
     import render
 
     if opt.png:
-        frames = np.arange(0, last + 1, max(1, round(opt.every * mocap.CONTROL_RATE)))
+        frames = np.arange(0, last + 1, max(1, round((opt.every or 0.5) * mocap.CONTROL_RATE)))
         labels = [f"{t / mocap.CONTROL_RATE:.1f} s" for t in frames]
         render.write_png(opt.png, render.contact_sheet(pictures(char, ref, recording, frames), labels, 5))
         print(opt.png)
@@ -678,14 +620,45 @@ def _write_pictures(char, ref, recording, last, opt):
 
 
 def find_policy(opt: Options):
-    """The policy named, or the shipped one; UserError says how to make one."""
-    name = Path(opt.character)
+    """The policy named, or the shipped one, its path and what its file says; UserError says how to make one."""
+    name = Path(opt.character or "jesse")
     shipped = name.with_suffix(".npz") if name.suffix == ".toml" else character.CHARACTERS / f"{name}.npz"
     path = Path(opt.policy) if opt.policy else shipped
     if not path.exists():
-        make = f"python ppo.py --character {opt.character} --out runs/a"
+        make = f"python ppo.py --character {name} --out runs/a"
         raise UserError(f"no policy {path}: train one ({make}), then --policy runs/a")
-    return load_policy(path)[0], path
+    policy, meta = load_policy(path)
+    return policy, path, meta
+
+
+def load_character(opt: Options, meta, path) -> Character:
+    """The character that the flags ask for; where they ask for nothing, the policy's own with its variation.
+
+    A flag changes that one thing; another character has none of the policy's variations.
+    Test      tests/test_play.py::test_character_of_the_policy"""
+    own = trained_as(meta, path) or character.Switches()
+    base = own if opt.character in (None, own.character) else character.Switches(opt.character)
+    given = {k: v for k in ("tail", "scale", "set") if (v := getattr(opt, k)) != getattr(character.Switches(), k)}
+    return replace(base, **given).load()
+
+
+def devices_of(meta, path, sensors: str | None) -> int:
+    """How many devices a policy was trained with, 3 or 1.  UserError: fewer than `sensors` "full" asks for
+
+    Test      tests/test_play.py::test_headset_only"""
+    devices = 1 if sensors_of(meta, path) == "hmd" else 3
+    if devices == 1 and sensors == "full":
+        raise UserError(f"{path}: was trained with the headset alone: leave out --sensors, or give --sensors hmd")
+    return devices
+
+
+def shown_to(meta, path, ref: Reference, sensors: str | None) -> Reference:
+    """What a policy is shown of the user: the devices it was trained with; with `sensors` "hmd" controllers hang.
+
+    Test      tests/test_play.py::test_headset_only"""
+    if devices_of(meta, path, sensors) == 1:
+        return headset_only(ref)
+    return stream.controllers_hang(ref) if sensors == "hmd" else ref
 
 
 def main(argv=None):
@@ -694,9 +667,22 @@ def main(argv=None):
     for i, a in enumerate(argv):  # --view alone means a window
         if a == "--view" and (i + 1 == len(argv) or argv[i + 1].startswith("--")):
             argv[i] = "--view=window"
+    if "--compare" in argv:  # A B … are one value
+        i = argv.index("--compare") + 1
+        n = next((k for k, a in enumerate(argv[i:]) if a.startswith("--")), len(argv) - i)
+        argv[i : i + n] = [",".join(argv[i : i + n])] * (n > 0)
     opt = cli(Options, argv, "play.py", __doc__)
-    if not (opt.measure or opt.png or opt.video or opt.bvh or opt.view or opt.stream):
-        raise UserError("nothing to do: give --measure, --png OUT, --video OUT, --bvh OUT, --view or --stream FILE")
+    if not (opt.measure or opt.png or opt.video or opt.bvh or opt.view or opt.stream or opt.compare):
+        raise UserError(
+            "nothing to do: give --measure, --compare A B, --png OUT, --video OUT, --bvh OUT, --view or --stream FILE"
+        )
+    if opt.compare:
+        many = len(opt.compare) > 1 and len(set(opt.compare)) == len(opt.compare)
+        if not many:
+            raise UserError(f"--compare {' '.join(opt.compare)}: valid: two policies or more, none twice")
+        plain, others = Options(), "policy character tail scale set stream view video bvh push".split()
+        if wrong := [f"--{k}" for k in others if getattr(opt, k) != getattr(plain, k)]:
+            raise UserError(f"--compare takes policies with their own characters: leave out {', '.join(wrong)}")
     if opt.stream and opt.bvh:
         raise UserError("--bvh records a motion, not a stream; give one of the two")
     if opt.stream and opt.measure:
@@ -705,12 +691,13 @@ def main(argv=None):
     for out in filter(None, (opt.json, opt.png, opt.video, opt.bvh)):
         if not Path(out).resolve().parent.is_dir():
             raise UserError(f"cannot write {out}: there is no folder {Path(out).parent}")
-    if opt.json and not opt.measure:
-        raise UserError("--json writes the table of --measure: give both")
-    char = character.load(opt.character)
-    policy, path = find_policy(opt)
+    if opt.json and not (opt.measure or opt.compare):
+        raise UserError("--json writes the table of --measure or --compare: give one of them")
+    if not opt.compare:
+        policy, path, meta = find_policy(opt)
+        char = load_character(opt, meta, path)
     if opt.stream:
-        play_stream(char, policy, path, opt)
+        play_stream(char, policy, path, devices_of(meta, path, opt.sensors), opt)
         return
     clips = mocap.sequences(
         opt.motion, "all" if opt.all else opt.split, opt.clips, seed=opt.seed, reading=Reading.of(opt)
@@ -719,21 +706,35 @@ def main(argv=None):
         clips = [mocap.resize(c, opt.user_scale) for c in clips]
     if opt.sequence >= len(clips):
         raise UserError(f"--sequence {opt.sequence}: there are {len(clips)}, from 0")
+    if opt.compare:
+        arms = arms_of(clips, opt)
+        print(*(a.title() for a in arms), sep="\n")
+        results = compare(arms, opt)
+        print(comparison(results))
+        if opt.json:
+            atomic_write(opt.json, as_json(results))
+        if opt.png:
+            import render
+
+            render.write_png(opt.png, comparison_sheet(arms, clips[opt.sequence], opt))
+            print(opt.png)
+        return
     ref = retarget.reference(char, clips)
-    check_fits(policy, Env(char, ref, 1), path)
+    seen = shown_to(meta, path, ref, opt.sensors)
+    check_fits(policy, Env(char, seen, 1), path)
     if opt.measure and push:
-        found = largest_push(char, ref, policy_action(policy), push.at, push.newtons, threads=opt.threads)
+        found = largest_push(char, seen, policy_action(policy), push.at, push.newtons, threads=opt.threads)
         print(push_report(found, push))
         if opt.json:
             as_lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in found.items()}
             atomic_write(opt.json, json.dumps(as_lists, indent=2) + "\n")
     elif opt.measure:
-        results = measure_all(char, ref, policy, opt)
+        results = measure_all(char, ref, policy, opt, seen)
         print(table(results))
         if opt.json:
             atomic_write(opt.json, as_json(results))
     if opt.png or opt.video or opt.bvh:
-        recording = simulate(char, ref, policy_action(policy), threads=opt.threads, only=[opt.sequence], push=push)[0]
+        recording = simulate(char, seen, policy_action(policy), threads=opt.threads, only=[opt.sequence], push=push)[0]
         last = min(len(recording.frames) - 1, int((opt.seconds or 10.0) * mocap.CONTROL_RATE))
         print(
             f"{ref.names[opt.sequence]}: lived {(len(recording.frames) - 1) / mocap.CONTROL_RATE:.1f} s "
@@ -742,9 +743,9 @@ def main(argv=None):
         if opt.bvh:
             retarget.write_bvh(opt.bvh, char, recording.qpos, mocap.CONTROL_RATE)
             print(opt.bvh)
-        _write_pictures(char, ref, recording, last, opt)
+        _write_pictures(char, seen, recording, last, opt)
     if opt.view:
-        show(char, ref, policy, opt.sequence, opt.view, opt.port, push)
+        show(char, seen, policy, opt.sequence, opt.view, opt.port, push)
 
 
 if __name__ == "__main__":

@@ -55,9 +55,11 @@ from rigs import HELP, Reading
 from runs import (
     ALL_POSITIVE,
     CHECKPOINT,
+    COUNT,
     METRICS,
     NONNEGATIVE,
     POSITIVE,
+    THREADS,
     UNIT,
     Metrics,
     Progress,
@@ -97,20 +99,20 @@ class Options(character.Switches):
     unit: str | None = arg(None, HELP["unit"])
     up: str | None = arg(None, HELP["up"])
     steps: int = arg(20_000_000, "control steps to train", check=POSITIVE)
-    envs: int = arg(512, "characters simulated side by side", check=POSITIVE)
-    horizon: int = arg(16, "control steps of each character per update", check=POSITIVE)
+    envs: int = arg(512, "characters simulated side by side", check=COUNT)
+    horizon: int = arg(16, "control steps of each character per update", check=COUNT)
     seed: int = arg(0, "seed of everything random", check=NONNEGATIVE)
     out: str | None = arg(None, "run folder; runs/CHARACTER by default")
     resume: bool = arg(False, "continue the run in --out exactly")
     ship: str | None = arg(None, "write the policy of the run in --out to this .npz, and train nothing")
     init: str | None = arg(None, "start from the weights of a policy (.npz) or a run folder")
-    threads: int = arg(0, "physics threads, 0 = all cores", check=NONNEGATIVE)
+    threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
     checkpoint_minutes: float = arg(3.0, "minutes between checkpoints", check=NONNEGATIVE)
     gamma: float = arg(0.97, "discount (QuestSim's)", check=UNIT)
     lam: float = arg(0.95, "lambda of generalised advantage estimation; 1 is Appendix B's return", check=UNIT)
     clip_eps: float = arg(0.2, "epsilon of the clipped loss", check=BELOW_ONE)
-    epochs: int = arg(4, "passes over the samples per update", check=POSITIVE)
-    minibatch: int = arg(2048, "samples per gradient step", check=POSITIVE)
+    epochs: int = arg(4, "passes over the samples per update", check=COUNT)
+    minibatch: int = arg(2048, "samples per gradient step", check=COUNT)
     lr: float = arg(1e-4, "policy's learning rate to start from; adapted to --target-kl", check=POSITIVE)
     value_lr: float = arg(1e-3, "value network's learning rate", check=POSITIVE)
     target_kl: float = arg(0.025, "KL divergence per update that the policy's learning rate aims at", check=POSITIVE)
@@ -291,12 +293,13 @@ class Policy:
         for name, own in (("policy.pi", self.theta_pi), ("policy.critic", self.critic.theta)):
             if arrays[name].shape != own.shape:
                 raise ValueError(f"{name} has shape {arrays[name].shape}, expected {own.shape}")
-            if arrays[name].dtype.kind != "f" or not np.all(np.abs(arrays[name]) <= WEIGHT_LIMIT):
+            if arrays[name].dtype.kind != "f" or not np.all(np.abs(arrays[name].astype(float)) <= WEIGHT_LIMIT):
                 raise ValueError(f"{name} holds no weights, valid: numbers of at most {WEIGHT_LIMIT:g}")
             own[:] = arrays[name]
         count, mean, m2 = (arrays[f"policy.norm.{k}"] for k in ("count", "mean", "m2"))
         if count.dtype.kind not in "iu" or mean.dtype.kind != "f" or m2.dtype.kind != "f" or count.min() < 0:
             raise ValueError("policy.norm holds no count, mean and sum of squares")
+        mean, m2 = mean.astype(float), m2.astype(float)
         if not np.all(np.abs(mean) <= NORM_LIMIT) or not np.all((m2 >= 0) & (m2 <= NORM_LIMIT)):
             raise ValueError(f"policy.norm's numbers are beyond 0 and {NORM_LIMIT:g}")
         self.norm.load_state(dict(count=count, mean=mean, m2=m2))
@@ -647,20 +650,20 @@ def make_env(opt: Options) -> Env:
 def initial_policy(path, env: Env, sigma) -> Policy:
     """The policy of --init, rearranged by the names of inputs and joints where it is another character's or knows more.
 
-    Of one with controllers the inputs that remain without them go on [§4.2].  Another character's policy keeps what the
-    two have names for in common; its normaliser and σ begin anew, because the sizes are others.
+    Of one with controllers the inputs that remain without them go on [§4.2]; of another variation of the character (its
+    tail, §5.1) what both have.  Another character's policy keeps what the two have names for in common; its normaliser
+    and σ begin anew, because the sizes are others.
     Raises    UserError: it does not fit; it knows the headset alone and the run has controllers
-    Test      tests/test_ppo.py::test_init_headset_only, test_init_of_another_character"""
+    Test      tests/test_ppo.py::test_init_headset_only, test_init_of_another_character, test_init_of_a_variation"""
     policy, meta = load_policy(path)
     trained = sensors_of(meta, path)
     if trained == "hmd" and env.devices == 3:
         raise UserError(f"{path}: was trained with the headset alone: give --sensors hmd")
-    source = meta["options"].get("character") if isinstance(meta.get("options"), dict) else None
-    if not isinstance(source, str):
+    own = trained_as(meta, path)
+    if own is None:
         check_fits(policy, env, path)
         return policy
-    same = source in (env.char.name, str(env.char.path))
-    char = env.char if same else character.load(source)
+    same, char = own.character in (env.char.name, str(env.char.path)), own.load()
     devices, asymmetric = (3 if trained == "full" else 1), policy.critic_size > policy.obs_size
     have = input_names(char, devices, asymmetric), [char.hinges[h] for h in char.driven]
     need = input_names(env.char, env.devices, asymmetric), [env.char.hinges[h] for h in env.char.driven]
@@ -679,6 +682,21 @@ def initial_policy(path, env: Env, sigma) -> Policy:
             f"{sum(i >= 0 for i in outputs)} of {len(outputs)} torques have the same names here and go on"
         )
     return policy
+
+
+def trained_as(meta, path) -> character.Switches | None:
+    """Which character, with which variation, a policy was trained for; None where its file names none.
+
+    Raises    UserError: its options are damaged
+    Test      tests/test_play.py::test_character_of_the_policy"""
+    options = meta.get("options")
+    if not isinstance(options, dict) or "character" not in options:
+        return None
+    found = {f.name: options.get(f.name, f.default) for f in fields(character.Switches)}
+    texts = [found["character"], found["tail"] or "", found["set"] or ""]
+    if not all(isinstance(t, str) for t in texts) or type(found["scale"]) not in (int, float) or not found["scale"] > 0:
+        raise UserError(f"{path}: its options name no character: {str(found)[:200]}; valid: what ppo.py wrote")
+    return character.Switches(**found)
 
 
 def sensors_of(meta, path) -> str:

@@ -391,9 +391,10 @@ class Options(character.Switches):
     bvh: str | None = arg(None, "write the character's kinematic pose in the first clip as BVH")
 
 
-def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360), camera="track"):
+def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360), camera="track", beside=None):
     """Images with the human (stick figure) at the left of the character.  -> list of (H, W, 3) uint8
 
+    Args      beside : (3,) [m] from the character to the human, world, instead of its left
     Test      tests/test_retarget.py::test_draw"""
     import render
 
@@ -406,7 +407,7 @@ def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360), camer
         mujoco.mj_forward(shown, data)
         left = quat_rotate(clip.quat[t, 0], np.array([0.0, 1.0, 0.0])) * [1, 1, 0]
         side = apart * left / max(np.linalg.norm(left), 1e-9)
-        points = np.concatenate([clip.pos[t], clip.ball[t]]) + side
+        points = np.concatenate([clip.pos[t], clip.ball[t]]) + (side if beside is None else beside)
         bones = list(mocap.PARENTS) + list(mocap.FEET)
         images.append(scene.frame(data, markers=render.stick_figure(points, bones)))
     return images

@@ -585,7 +585,7 @@ def _unknown(group, reading):
         for s, n in [*joints.items(), *zip(("ball_l", "ball_r"), balls)]
         if s not in given and not (ends and s[:4] == "ball")
     ]
-    say = lambda text: print(f"{b.path}: {text}", file=sys.stderr)  # noqa: E731
+    say = lambda text: print(printable(f"{b.path}: {text}"), file=sys.stderr)  # noqa: E731
     if pairs:
         say(f"rig guessed from the joints' names: {', '.join(pairs)}")
 

@@ -26,9 +26,11 @@ import struct
 import subprocess
 import sys
 import time
+import tokenize
 import tomllib
 import types
 import typing
+import warnings
 import zipfile
 import zlib
 from importlib import metadata
@@ -62,11 +64,17 @@ def printable(text) -> str:
 
 
 def run_main(main_fn, argv=None):
-    """Call main_fn(argv), then exit: its own int, or 2 for a UserError (one line on stderr), or 130 if interrupted."""
+    """Call main_fn(argv), then exit: its own int; 2 and one line for a UserError or too little memory; 130 on Ctrl-C.
+
+    Test      tests/test_runs.py::test_run_main
+    """
     try:
         code = main_fn(sys.argv[1:] if argv is None else argv)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
+        code = 2
+    except MemoryError as error:
+        print(f"error: not enough memory: {printable(str(error))[:MESSAGE]}; give smaller numbers", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -79,6 +87,8 @@ def run_main(main_fn, argv=None):
 POSITIVE = (lambda v: np.isfinite(v) and v > 0, "greater than 0")
 NONNEGATIVE = (lambda v: np.isfinite(v) and v >= 0, "0 or greater")
 UNIT = (lambda v: 0 <= v <= 1, "from 0 to 1")
+COUNT = (lambda v: 1 <= v <= 10**6, "from 1 to 1000000")
+THREADS = (lambda v: 0 <= v <= 1024, "from 0 to 1024")
 ALL_POSITIVE = (lambda v: len(v) > 0 and all(x > 0 for x in v), "one or more numbers greater than 0, as in 256,128")
 
 
@@ -547,7 +557,12 @@ def _read_arrays(path):
             with archive.open(member) as file:
                 version = np.lib.format.read_magic(file)
                 read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-                shape, fortran, dtype = read_header[version](file)
+                try:
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("error")  # of headers as Python 2 wrote them
+                        shape, fortran, dtype = read_header[version](file)
+                except (KeyError, SyntaxError, tokenize.TokenError, Warning) as error:
+                    raise ValueError(f"array {name!r} has a damaged header ({error})") from None
                 data = file.read()
             if dtype.kind not in "biufcUS" or not dtype.itemsize:
                 raise ValueError(f"array {name!r} is of {dtype}, not of numbers or text")
@@ -566,19 +581,22 @@ def latest_checkpoint(folder, finite=()):
     Raises    UserError: there are checkpoints and none is readable
     Test      tests/test_runs.py::test_latest_falls_back
     """
-    paths = [p for p in (Path(folder) / CHECKPOINT, Path(folder) / PREVIOUS) if p.exists()]
-    for path in paths:
+    failed = None
+    for path in (Path(folder) / CHECKPOINT, Path(folder) / PREVIOUS):
+        if not path.exists():
+            continue
         try:
             loaded = load_checkpoint(path, finite)
         except UserError as error:
-            print(f"note: {error}", file=sys.stderr)
-            failed = error
+            failed = failed or error
             continue
         if path.name == PREVIOUS:
+            if failed:
+                print(f"note: {failed}", file=sys.stderr)
             print(f"note: using the previous checkpoint, {path}", file=sys.stderr)
         return loaded
-    if paths:
-        raise UserError(f"no readable checkpoint in {folder}; last tried: {failed}")
+    if failed:
+        raise UserError(f"no readable checkpoint in {folder}: {failed}")
     return None
 
 

@@ -125,9 +125,10 @@ class Reader:
             raise UserError(f"{self.name}, line {self.line}: column {twice[0]} is there twice; valid: once each")
         if missing:
             more = f" and {len(missing) - 4} more" if len(missing) > 4 else ""
+            alone = "" if any(c.startswith("head") for c in missing) else "; --sensors hmd needs the headset's alone"
             raise UserError(
                 f"{self.name}, line {self.line}: no column {', '.join(missing[:4])}{more}; "
-                f"it has {', '.join(self.names)[:200]}; valid: {valid_columns()}"
+                f"it has {', '.join(self.names)[:200]}; valid: {valid_columns()}{alone}"
             )
         self.at = [known.index(c) if c in known else -1 for c in self.wanted]
 

@@ -56,3 +56,16 @@ def test_physics_table():
     assert by[4, "PGS", 10]["root_mm"] < by[2, "PGS", 5]["root_mm"] < 50
     assert all(r["bad"] == 0 and 0 < r["sole_mm"] < 50 and r["survived"] > 0.5 for r in rows)
     assert before == (char.model.opt.solver, char.model.opt.iterations)
+
+
+def test_bench_drop(tmp_path, capsys, monkeypatch):
+    """The figures of DROP's simulator exist, and characters cost in proportion."""
+    short = bench.bench_drop
+    monkeypatch.setattr(bench, "bench_drop", lambda rounds: short(frames=5, rounds=3))
+    monkeypatch.setattr(bench.drop_demos, "BUILTIN", (("walk", 6, {"speed": 1.2}), ("stand", 4, {})))
+    out = tmp_path / "bench.json"
+    bench.main(["--drop", "--json", str(out)])
+    r = json.loads(out.read_text())["drop"]
+    assert r["fps"] > 20 and r["fps_pushed"] > 20 and set(r["samples"]) == {"1", "4", "64", "256"}
+    assert r["characters"]["8"] < 0.5 * r["characters"]["2"] < r["fps"]
+    assert "frames/s" in capsys.readouterr().out

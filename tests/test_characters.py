@@ -478,7 +478,6 @@ def one_line(error, *parts):
         assert part in text, f"{part!r} is not in: {text}"
 
 
-@pytest.mark.filterwarnings("ignore:Inertia matrix")  # of two hinges about one axis
 @pytest.mark.parametrize("file,old,new,says", [m[1:] for m in MUTATIONS], ids=[m[0] for m in MUTATIONS])
 def test_checks(tmp_path, thin_xml, file, old, new, says):
     """Each mistake in the TOML or the MJCF is one line that names the file, the place and what would be valid."""

@@ -703,6 +703,23 @@ def test_init_of_another_character(whole, tmp_path, capsys):
     np.testing.assert_allclose(new.critic(y), old.critic(x), atol=1e-5)
 
 
+def test_init_of_a_variation(tmp_path):
+    """Dino's tail without motors: four are gone, the others' torques and the normaliser are as they were."""
+    clip, rng = mocap.builtin_clips()[0][:40], np.random.default_rng(0)
+    whole, limp = (character.load("dino", tail=tail) for tail in (None, "passive"))
+    a, b = (Env(c, retarget.reference(c, [clip]), 3, threads=1) for c in (whole, limp))
+    assert a.obs_size == b.obs_size and a.action_size == b.action_size + 4
+    old = Policy(a.obs_size, a.critic_size, a.action_size, (8,), (4,), 0.1, 1.0, rng)
+    old.norm.update(rng.normal(size=(50, a.critic_size)))
+    save_checkpoint(tmp_path / "p.npz", old.arrays(), {"policy": old.shape(), "options": {"character": "dino"}})
+    new = ppo.initial_policy(tmp_path / "p.npz", b, 0.3)
+    x = rng.normal(size=(5, a.obs_size)).astype(np.float32)
+    kept = [k for k, h in enumerate(whole.driven) if not whole.hinges[h].startswith("tail")]
+    np.testing.assert_allclose(new.mean_action(x), old.mean_action(x)[:, kept], atol=1e-6)
+    np.testing.assert_array_equal(new.norm.mean, old.norm.mean)
+    np.testing.assert_array_equal(new.log_std, old.log_std[kept])
+
+
 def test_policy_round_trip(tmp_path, char, ref):
     """What is played is what was trained: the normaliser is in the file, and frozen."""
     t = trainer_of(char, ref)

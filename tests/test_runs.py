@@ -79,8 +79,16 @@ def test_help_shows_every_flag_and_default(capsys):
     assert text.count("(default:") == 8
 
 
-@pytest.mark.parametrize("error, code", [(None, 0), (UserError("bad\nfile"), 2), (KeyboardInterrupt(), 130)])
-def test_run_main(error, code, capsys):
+@pytest.mark.parametrize(
+    "error, code, told",
+    [
+        (None, 0, ""),
+        (UserError("bad\nfile"), 2, "error: bad file\n"),
+        (MemoryError("8 TiB"), 2, "error: not enough memory: 8 TiB; give smaller numbers\n"),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+    ],
+)
+def test_run_main(error, code, told, capsys):
     def main(argv):
         if error is not None:
             raise error
@@ -88,7 +96,7 @@ def test_run_main(error, code, capsys):
     with pytest.raises(SystemExit) as stopped:
         runs.run_main(main, [])
     assert stopped.value.code == code
-    assert capsys.readouterr().err == {0: "", 2: "error: bad file\n", 130: "interrupted\n"}[code]
+    assert capsys.readouterr().err == told
 
 
 def test_user_error_is_one_line():

@@ -426,7 +426,7 @@ def test_headset_only(jesse, walk):
     times = np.arange(len(pos)) / 30
     lines = to_csv(times, pos, quat)
     headset = [",".join(line.strip().split(",")[:8]) + "\n" for line in lines]
-    with pytest.raises(UserError, match="no column left_px, .* and 10 more"):
+    with pytest.raises(UserError, match="no column left_px, .* and 10 more.*--sensors hmd"):
         list(Reader("x").read(headset))
     with pytest.raises(UserError, match="no column head_qw"):
         list(Reader("x", devices=1).read([",".join(line.split(",")[:7]) + "\n" for line in headset]))

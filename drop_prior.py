@@ -1,0 +1,178 @@
+r"""Motion priors for DROP's simulator that need no training  [DROP §5].
+
+A prior is anything with
+
+    sample(state, n, rng) -> positions (m, 22, 3), rotations (m, 22, 4), m <= n     Eq. 9: the set of samples
+    mode(state)           -> positions (22, 3), rotations (22, 4)                   its most likely next frame
+
+`state` is a `drop.State`: x and v hold the solved motion, v_own the velocities the prior itself predicted, which §7
+does not overwrite.  Positions are bones of the right lengths, rotations global, both in the world frame.  m = 0 says
+that nothing fits here; that step is a rag doll's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drop import STEP, J, N, forward_kinematics
+from human import heading, quat_conj, quat_mul
+
+
+class ClipPrior:
+    r"""The next frame of a clip, always  [DROP §8.1: the mock prior].
+
+    Args      x : (T, 22, 3), quat : (T, 22, 4); start : frame of the clip at the simulation's frame 0
+    Test      tests/test_drop.py::test_clip_and_switch_priors
+    """
+
+    def __init__(self, x, quat, start=0):
+        self.x, self.quat, self.start = x, quat, start
+
+    def mode(self, state):
+        """The clip's next frame; after its end, the last."""
+        i = min(self.start + state.frame + 1, len(self.x) - 1)
+        return self.x[i], self.quat[i]
+
+    def sample(self, state, n, rng):
+        """A set of one."""
+        x, quat = self.mode(state)
+        return x[None], quat[None]
+
+
+class SwitchPrior:
+    """One prior before a frame (the onset of the force), another from it on  [DROP §8.1].
+
+    Test: tests/test_drop.py::test_clip_and_switch_priors"""
+
+    def __init__(self, first, second, frame):
+        self.first, self.second, self.frame = first, second, frame
+
+    def _now(self, state):
+        return self.first if state.frame < self.frame else self.second
+
+    def mode(self, state):
+        """The current prior's."""
+        return self._now(state).mode(state)
+
+    def sample(self, state, n, rng):
+        """The current prior's."""
+        return self._now(state).sample(state, n, rng)
+
+
+MATCHED = np.array([J[n] for n in (
+    "hip_l", "hip_r", "spine3", "head", "knee_l", "knee_r", "ankle_l", "ankle_r", "foot_l", "foot_r", "wrist_l",
+    "wrist_r")])  # fmt: skip
+
+
+class NearestPrior:
+    r"""Transitions of recorded motion that start near the present state, as in a Motion Field (Lee et al. 2010).
+
+    Method    features: 12 joints in the heading frame over the pelvis's place on the floor, and τ times their
+              velocities; of the nearest 2 n frames of the set n are drawn; each gives its next frame, turned to the
+              character's heading: the root moves as recorded, and the difference between character and recording decays
+              by β a step; heights are counted from the floor under the pelvis
+    ASSUMED   τ, β, the joints, the number of principal components searched, `reach`; and that beyond `reach` nothing
+              fits and the prior says so with no samples
+    Args      clips : list of (x (T, 22, 3), quat (T, 22, 4)) on a floor at z = 0; tau [s]; beta, beta_height [-]: of
+              rotations and of the root's height; reach : RMS distance [m]; spread : standard deviation of the angle
+              [rad] by which samples are turned away from the heading (the turn then decays in: the character turns);
+              floor : Plane under the character, or None
+    Test      tests/test_drop.py::test_nearest_prior
+    """
+
+    def __init__(self, clips, tau=0.1, beta=0.2, beta_height=1.0, reach=0.25, spread=0.3, components=16,
+                 floor=None):  # fmt: skip
+        self.tau, self.beta, self.beta_height, self.reach = tau, beta, beta_height, reach
+        self.spread, self.floor = spread, floor
+        features, before, after, q0, q1 = [], [], [], [], []
+        for x, quat in clips:
+            if len(x) < 3:
+                continue
+            features.append(self.features(x[1:-1], (x[1:-1] - x[:-2]) / STEP, quat[1:-1]))
+            before.append(x[1:-1, 0]), after.append(x[2:, 0]), q0.append(quat[1:-1]), q1.append(quat[2:])
+        if not features:
+            raise ValueError("NearestPrior: no clip has three frames or more")
+        self.x0, self.x1, q0, self.q1 = map(np.concatenate, (before, after, q0, q1))
+        self.yaw, self.change = heading(q0[:, 0]), quat_mul(quat_conj(q0), self.q1)
+        f = np.concatenate(features)
+        self.mean = f.mean(axis=0)
+        _, _, vt = np.linalg.svd((f - self.mean)[:: max(len(f) // 4000, 1)], full_matrices=False)
+        self.basis = vt[:components].T
+        self.bank = ((f - self.mean) @ self.basis).astype(np.float32)
+        self.norm = np.einsum("ij,ij->i", self.bank, self.bank)
+        self._last = self._mode = None
+
+    def features(self, x, v, quat):
+        """(T, 72) features whose distances are RMS metres a joint.  x, v (T, 22, 3), quat (T, 22, 4)."""
+        yaw = heading(quat[:, 0])
+        c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+        p, u = x[:, MATCHED] - x[:, :1] * [1, 1, 0], self.tau * v[:, MATCHED]
+        both = np.concatenate([p, u], axis=1)
+        turned = np.stack([c * both[..., 0] + s * both[..., 1], c * both[..., 1] - s * both[..., 0], both[..., 2]], -1)
+        return turned.reshape(len(x), -1) / np.sqrt(len(MATCHED))
+
+    def ground(self, x):
+        """Height of the floor under the pelvis of x (22, 3) [m]."""
+        f = self.floor
+        return 0.0 if f is None else (f.offset - f.normal[:2] @ x[0, :2]) / f.normal[2]
+
+    def nearest(self, state, n):
+        """Numbers of the n nearest frames, nearest first, and the distance of the nearest [m]."""
+        x = state.x - [0.0, 0.0, self.ground(state.x)]
+        f = self.features(x[None], state.v[None], state.quat[None])[0] - self.mean
+        z = f @ self.basis
+        d = self.norm - 2.0 * (self.bank @ z.astype(np.float32))
+        n = min(n, len(d))
+        pick = np.argpartition(d, n - 1)[:n] if n < len(d) else np.arange(n)
+        pick = pick[np.argsort(d[pick])]
+        return pick, float(np.sqrt(max(d[pick[0]] + f @ f, 0.0)))
+
+    def follow(self, state, pick, turn=0.0):
+        r"""The next frames (m, 22, 3), (m, 22, 4) that transitions `pick` lead to from `state`.
+
+        Equation  q = (1 − β) q_state (q0⁻¹ q1) + β q_yaw q1, normalised: the character goes on by the recorded rotation
+                  of this frame, and is drawn towards the recorded pose
+        """
+        yaw = heading(state.quat[0]) - self.yaw[pick] + turn
+        c, s = np.cos(0.5 * yaw)[:, None], np.sin(0.5 * yaw)[:, None]
+        w, x, y, z = np.moveaxis(self.q1[pick], -1, 0)
+        recorded = np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=-1)  # q_yaw q1
+        w, x, y, z = state.quat.T
+        left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]).transpose(2, 0, 1)
+        carried = np.matmul(left, self.change[pick][..., None])[..., 0]  # q_state (q0⁻¹ q1)
+        same = np.einsum("...i,...i", carried, recorded)[..., None] >= 0  # q and −q are one rotation
+        quat = (1.0 - self.beta) * np.where(same, carried, -carried) + self.beta * recorded
+        quat /= np.sqrt(np.einsum("...i,...i", quat, quat))[..., None]
+        travel, ground = self.x1[pick] - self.x0[pick], self.ground(state.x)
+        c, s = np.cos(yaw), np.sin(yaw)
+        root = np.stack([
+            state.x[0, 0] + c * travel[:, 0] - s * travel[:, 1],
+            state.x[0, 1] + s * travel[:, 0] + c * travel[:, 1],
+            self.x1[pick, 2] + (1.0 - self.beta_height) * (state.x[0, 2] - ground - self.x0[pick, 2]) + ground,
+        ], axis=1)  # fmt: skip
+        return forward_kinematics(root, quat), quat
+
+    def sample(self, state, n, rng):
+        """n of the 2 n nearest transitions, drawn without replacement; without rng the n nearest."""
+        pick, distance = self._nearest(state, 2 * n)
+        if distance > self.reach:
+            return np.zeros((0, N, 3)), np.zeros((0, N, 4))
+        drawn, turn = pick[:n], np.zeros(min(n, len(pick)))
+        if rng is not None:
+            drawn = rng.choice(pick, len(turn), replace=False)
+            turn = rng.normal(0.0, self.spread, len(turn))
+        x, quat = self.follow(state, np.append(pick[0], drawn), np.append(0.0, turn))
+        self._mode = state, x[0], quat[0]  # the simulator asks for the mode of the same state next
+        return x[1:], quat[1:]
+
+    def mode(self, state):
+        """The nearest transition."""
+        if self._mode is None or self._mode[0] is not state:
+            x, quat = self.follow(state, self._nearest(state, 1)[0][:1])
+            self._mode = state, x[0], quat[0]
+        return self._mode[1:]
+
+    def _nearest(self, state, n):
+        if self._last is None or self._last[0] is not state or len(self._last[1]) < min(n, len(self.norm)):
+            self._last = state, *self.nearest(state, n)
+        return self._last[1:]

@@ -1,0 +1,237 @@
+"""drop_demos.py: what is measured is right, every demonstration runs, and shows what it should."""
+
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import drop
+import drop_demos as demos
+import render
+from drop import RADII, STEP, J, N, Plane, Simulator, State
+from runs import UserError, run_main
+
+SHORT = (
+    ("walk", 8, {"speed": 1.2}), ("jog", 8, {"speed": 2.5}), ("turn", 8, {"speed": 1.1, "turn_rate": 0.6}),
+    ("stand", 6, {}), ("sidestep", 6, {"sidestep": 0.4}),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def stage():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demos, "BUILTIN", SHORT)
+        yield demos.Stage(demos.Options())
+
+
+def cut(monkeypatch, frames):
+    """Shorten every take."""
+    single = demos.single
+    monkeypatch.setattr(
+        demos, "single", lambda name, sim, state, n, rng, act: single(name, sim, state, min(n, frames), rng, act)
+    )
+
+
+def test_motions(stage, tmp_path):
+    assert [c[0].split("_")[0] for c in stage.clips] == [k for k, _, _ in SHORT]
+    assert abs(demos.pace(stage.clips[0][1]) - 1.2) < 0.1
+    assert demos.pick_motion(stage.clips, 2.4)[0].startswith("jog")
+    assert demos.pick_motion(stage.clips, 0.0)[0].startswith("stand")
+    with pytest.raises(UserError, match="no such file or folder"):
+        demos.motions(demos.Options(motion=str(tmp_path / "nothing")))
+
+
+def test_fallen():
+    x = drop.forward_kinematics(drop.OFFSETS[0], np.tile([1.0, 0, 0, 0], (N, 1)))
+    at = lambda x: State(x, 0 * x, np.zeros((N, 4)))  # noqa: E731
+    assert not demos.fallen(at(x)) and demos.fallen(at(x - [0, 0, 0.5]))
+    lying = x @ Rotation.from_euler("y", 80, degrees=True).as_matrix().T + [0, 0, 1.0]
+    assert demos.fallen(at(lying))
+    assert not demos.fallen(at(x + [2.0, 0, 0.5]), Plane(np.array([-0.24, 0, 0.97]), 0.0))
+
+
+def test_measure(stage):
+    """Against a motion whose numbers are known: shifted by 1 cm a frame, feet in contact, 2 cm below the floor."""
+    x = drop.forward_kinematics(drop.OFFSETS[0], np.tile([1.0, 0, 0, 0], (N, 1))) - [0, 0, 0.02]
+    _, found = Simulator().step(State(x, 0 * x, np.tile([1.0, 0, 0, 0], (N, 1))))
+    found.active[:] = True
+    take = demos.Take("t")
+    for t in range(20):
+        take.add([State(x + [0.01 * t, 0, 0], 0 * x, np.zeros((N, 4)))], [found])
+    (r,) = demos.measure(take)
+    assert r["speed"] == pytest.approx(0.3) and r["slide"] == pytest.approx(0.3)
+    assert r["below_mm"] == pytest.approx(20 - 1e3 * (x + [0, 0, 0.02])[:, 2].__sub__(RADII).min(), abs=1e-6)
+    assert r["end"] == "upright" and r["bone"] < 1e-9 and r["limp"] == 1.0
+    assert "0.30 m/s" in demos.report(take)
+
+
+def test_ball_momentum(stage):
+    """What the ball loses the body gets: impulses are equal and opposite; a ball that misses falls freely."""
+    _, state = stage.start(0.0)
+    target = state.x[J["spine3"]]
+    ball = demos.Ball(target + [0.0, 0.6, 0.0], np.array([0.0, -9.0, 0.0]))
+    before, given = ball.v.copy(), np.zeros(3)
+    for _ in range(6):
+        force = ball.frame(state)
+        given += force.sum(axis=0) * STEP
+    lost = ball.mass * (before + 6 * STEP * drop.GRAVITY - ball.v)
+    np.testing.assert_allclose(given, lost, atol=1e-9)
+    assert np.linalg.norm(given) > 3.0
+    free = demos.Ball(np.array([9.0, 9.0, 5.0]), np.array([1.0, 0.0, 0.0]))
+    assert np.abs(free.frame(state)).max() == 0
+    np.testing.assert_allclose(free.x[:2], [9 + STEP, 9.0])
+    low = demos.Ball(np.array([9.0, 9.0, 0.13]), np.array([0.0, 0.0, -3.0]))
+    for _ in range(30):
+        low.frame(state)
+    assert low.x[2] > 0.11 and abs(low.v[2]) < 1.5
+
+
+def test_escape(stage):
+    """Across a ball's path, not along it; nothing to flee from, nothing to do."""
+    _, state = stage.start(0.0)
+    coming = demos.Ball(state.com + [4.0, 0, 0], np.array([-9.0, 0, 0]))
+    v = demos.escape(state, [coming])
+    assert abs(v[1]) > abs(v[0]) and np.linalg.norm(v) == pytest.approx(1.4)
+    assert demos.escape(state, [demos.Ball(state.com + [4.0, 0, 0], np.array([9.0, 0, 0]))]) is None
+    assert demos.escape(state, []) is None
+
+
+def test_cylinder_momenta(stage):
+    """A rigid body turned with growing speed about its centre of mass: L̇ = I α, I by points that fill the bones."""
+    mass, inertia = demos.cylinder_inertia()
+    assert mass.sum() == pytest.approx(N)
+    np.testing.assert_allclose(inertia, np.swapaxes(inertia, 1, 2), atol=1e-12)
+    rest = np.tile([1.0, 0, 0, 0], (N, 1))
+    x0 = drop.forward_kinematics(drop.OFFSETS[0], rest)
+    middle = 0.5 * (x0[1:] + x0[drop.PARENTS[1:]])
+    x0, middle = x0 - mass @ middle / N, middle - mass @ middle / N
+    axis, alpha = np.array([0.0, 0.0, 1.0]), 3.0
+    angle = 0.5 * alpha * (np.arange(5) * STEP) ** 2
+    turns = Rotation.from_rotvec(angle[:, None] * axis)
+    x = np.array([r.apply(x0) for r in turns])
+    quat = np.repeat(turns.as_quat(scalar_first=True)[:, None], N, axis=1)
+    b, com = demos.momenta_of_cylinders(x, quat)
+    whole = sum(m * (p @ p * np.eye(3) - np.outer(p, p)) + i for m, p, i in zip(mass, middle, inertia))
+    np.testing.assert_allclose(b[0, 3:], whole @ axis * alpha, atol=2e-2)
+    np.testing.assert_allclose(b[0, :3], 0.0, atol=1e-9)
+    np.testing.assert_allclose(com, 0.0, atol=1e-9)
+    j = J["knee_l"] - 1  # one bone's inertia by points that fill a cylinder
+    rng, length = np.random.default_rng(0), drop.LENGTHS[j]
+    r = 0.8 * min(RADII[J["knee_l"]], RADII[J["hip_l"]])
+    disc = rng.uniform(-1, 1, (400_000, 2))
+    disc = disc[np.sum(disc**2, axis=1) < 1] * r
+    points = np.column_stack([disc, rng.uniform(-0.5, 0.5, len(disc)) * length])
+    brute = mass[j] * np.mean(
+        np.sum(points**2, axis=1)[:, None, None] * np.eye(3) - points[:, :, None] * points[:, None], axis=0
+    )
+    np.testing.assert_allclose(inertia[j], brute, atol=2e-2 * brute.max())
+
+
+def test_root_wrench_of_motions(stage):
+    """Standing needs next to none, walking little, a walk hung in the air the body's weight; both models agree."""
+    walk, stand = stage.clips[0], stage.clips[3]
+    points, cylinders = (demos.root_wrench(walk[1][:90], walk[2][:90], c) for c in (False, True))
+    assert np.median(points) < 15 and np.corrcoef(points, cylinders)[0, 1] > 0.7
+    assert np.median(demos.root_wrench(stand[1][:60], stand[2][:60])) < 5
+    hung = demos.root_wrench(walk[1][:40] + [0, 0, 1], walk[2][:40])
+    assert abs(np.median(hung) / (N * 9.81) - 1) < 0.2
+
+
+def test_shapes_and_arrows(stage):
+    _, state = stage.start(0.0)
+    shapes = demos.body_shapes(state.x, demos.COLOURS[0])
+    assert len(shapes) == N and isinstance(shapes[-1], render.Marker)
+    shaft, head = demos.arrow(np.array([0.0, 0, 1]), [0.0, 0, 100.0], (1, 0, 0, 1))
+    assert np.linalg.norm(head.end - [0, 0, 1]) < np.linalg.norm(shaft.start - [0, 0, 1]) <= 0.8
+    assert demos.arrow(np.zeros(3), np.zeros(3), (1, 0, 0, 1)) == []
+
+
+@pytest.mark.parametrize("name", [n for n in demos.DEMOS if n not in ("backflip", "follow")])
+def test_every_demo(name, stage, monkeypatch):
+    """A second and a third of each: finite, bones exact, a line of numbers."""
+    cut(monkeypatch, 40)
+    if name == "collide":
+        monkeypatch.setattr(demos, "range", lambda n: range(min(n, 40)), raising=False)
+    if name == "wrench":
+        monkeypatch.setattr(stage, "clips", stage.clips[:2])
+    takes = demos.DEMOS[name](stage, np.random.default_rng(0))
+    for take in takes:
+        for r in demos.measure(take):
+            assert r["bone"] < 1e-6 and np.isfinite([v for v in r.values() if not isinstance(v, (str, dict))]).all()
+        assert take.name in demos.report(take)
+
+
+def test_follower_keeps_the_speed(stage):
+    """1.2 m/s through one turn: mean speed within 15 %, and facing the new way."""
+    take = demos._follow(stage, np.random.default_rng(0), 1.2, False, frames=210)
+    (r,) = demos.measure(take)
+    com = np.array([s[0].com[:2] for s in take.states])
+    mean = np.linalg.norm(np.diff(com, axis=0), axis=1).mean() / STEP
+    assert abs(mean / 1.2 - 1) < 0.15 and r["end"] == "upright"
+    turned = drop_turn(take.states[-1][0].quat[0], take.states[0][0].quat[0])
+    assert 60 < turned < 120
+
+
+def drop_turn(a, b):
+    d = demos.heading(a) - demos.heading(b)
+    return np.degrees((d + np.pi) % (2 * np.pi) - np.pi)
+
+
+def test_a_tripped_runner_falls_and_a_walker_is_stopped(stage):
+    walk, run = demos.trip(stage, np.random.default_rng(0))
+    assert "heel held" in walk.notes and "heel held" in run.notes
+    slowest = float(re.search(r"([\d.]+) at the least", walk.notes["stumble"])[1])
+    assert slowest < 0.8
+    assert demos.measure(run)[0]["end"] == "fell"
+
+
+def test_a_tilted_walker_stays_on_the_platform(stage):
+    for take in demos.tilt(stage, np.random.default_rng(0)):
+        (r,) = demos.measure(take)
+        assert r["end"] == "upright" and r["below_mm"] < 60
+        assert np.degrees(np.arccos(take.floor[-1].normal[2])) == pytest.approx(15)
+
+
+def test_backflip(stage, monkeypatch):
+    """Without a flip it says so; with one (a clip turned over in the air) the clip is tracked until the push."""
+    with pytest.raises(UserError, match="turns upside down"):
+        demos.backflip(stage, np.random.default_rng(0))
+    n = 120
+    turn = Rotation.from_rotvec(np.interp(np.arange(n), [30, 60], [0, -2 * np.pi])[:, None] * [0.0, 1.0, 0.0])
+    quat = np.repeat(turn.as_quat(scalar_first=True)[:, None], N, axis=1)
+    height = drop.STANDING + np.interp(np.arange(n), [30, 45, 60], [0, 0.9, 0])
+    x = drop.forward_kinematics(np.stack([0 * height, 0 * height, height], axis=1), quat)
+    monkeypatch.setattr(stage, "clips", [*stage.clips, ("flip", x, quat)])
+    (take,) = demos.backflip(stage, np.random.default_rng(0))
+    up = [Rotation.from_quat(s[0].quat[0], scalar_first=True).apply([0, 0, 1])[2] for s in take.states]
+    assert min(up) < -0.5 and len(take.arrows[0]) == 0 and any(take.arrows)
+
+
+def test_command(monkeypatch, capsys, tmp_path):
+    """python drop.py DEMO: help, numbers, pictures, and one line for whatever is wrong."""
+    monkeypatch.setattr(demos, "BUILTIN", SHORT)
+    cut(monkeypatch, 12)
+
+    def run(*args):
+        with pytest.raises(SystemExit) as end:
+            run_main(drop.main, [str(a) for a in args])
+        return end.value.code, capsys.readouterr()
+
+    code, out = run("--help")
+    assert code == 0 and "--prior" in out.out and "stiff-knee" in out.out
+    code, out = run("dance")
+    assert code == 2 and out.err.count("\n") == 1 and "valid: push, " in out.err
+    assert run()[0] == 2
+    code, out = run("push", "--prior", "guess")
+    assert code == 2 and "nearest" in out.err
+    code, out = run("backflip")
+    assert code == 2 and "turns upside down" in out.err
+    for prior in ("clip", "none"):
+        code, out = run("stiff-knee", "--prior", prior)
+        assert code == 0 and "stiff knee" in out.out
+    if render.gl_backend() is None:
+        pytest.skip("no OpenGL: neither egl nor osmesa starts here")
+    sheet = tmp_path / "sheet.png"
+    code, out = run("stiff-knee", "--png", sheet)
+    assert code == 0 and sheet.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and sheet.stat().st_size > 20_000

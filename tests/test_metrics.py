@@ -1,0 +1,358 @@
+"""Metrics: each against a slow loop, and on motions whose value is known; tables."""
+
+import json
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+import character
+import metrics
+import mocap
+import play
+import retarget
+from env import too_far
+from metrics import Recording
+from retarget import forward_kinematics
+from runs import UserError
+
+KEYS = (  # spec: every key of every row
+    "clips completed survival root_cm head_cm hands_cm joint_pos_cm head_deg joint_rot_deg sip_deg foot_slide_cm_s "
+    "penetration_mm contact_agreement jitter_m_s3 human_jitter_m_s3 steps_per_m human_steps_per_m head_wobble_deg_s "
+    "torque_rms saturation"
+).split()
+
+
+pytestmark = pytest.mark.usefixtures("motions_once")
+
+
+@pytest.fixture(scope="module")
+def char():
+    return character.load("jesse")
+
+
+@pytest.fixture(scope="module")
+def ref(char):
+    walk, stand = (mocap.load("builtin", clips=c)[0] for c in ("walk_005", "stand_007"))
+    return retarget.reference(char, [walk[:40], stand[:90], walk[60:90]])
+
+
+def still(char, ref, t=31, yaw=0.0):
+    """A reference and a recording of t frames in the default pose, upright: the blank page of hand-made motions."""
+    f = np.arange(t)
+    qpos = np.zeros((t, char.model.nq))
+    qpos[:, 2], qpos[:, 3], qpos[:, 7:] = char.hip_height, 1.0, char.default
+    fk = forward_kinematics(char, qpos)
+    changes = dict(first=np.array([0]), last=np.array([t - 1]), qpos=qpos, qvel=np.zeros((t, char.model.nv)))
+    changes |= dict(sensor_pos=fk.site_xpos.copy(), orientation=fk.xquat[:, [char.root, char.head]].copy())
+    changes |= dict(contact=np.zeros((t, 2), bool), human_pos=np.zeros((t, 15, 3), np.float32))
+    action = np.zeros((t, len(char.limits)))
+    return replace(ref, **changes), Recording(f, qpos.copy(), np.zeros((t, 2), bool), action, False, t - 1)
+
+
+# ------------------------------------------------------------------------------------ one function each
+
+
+def angle(a, b):
+    """Between two rotation matrices, by the trace."""
+    return np.degrees(np.arccos(np.clip((np.trace(a @ b.T) - 1) / 2, -1, 1)))
+
+
+def matrix(q):
+    out = np.zeros(9)
+    mujoco.mju_quat2Mat(out, np.asarray(q, float))
+    return out.reshape(3, 3)
+
+
+def test_metrics_against_slow_loop(char, ref):
+    """Every key, one frame and one body at a time, through mj_forward and rotation matrices."""
+    recordings = play.simulate(char, ref, play.pd_action, threads=1)
+    rng = np.random.default_rng(0)
+    for r in recordings:  # noise, so that no metric is near its ideal
+        r.qpos[1:, 7:] += 0.05 * rng.standard_normal(r.qpos[1:, 7:].shape)
+        r.contact[1:] ^= rng.random(r.contact[1:].shape) < 0.2
+        r.qpos[1:, 2] -= 0.02 * rng.random(len(r.qpos) - 1)
+    found = metrics.measure(char, ref, recordings)
+    m, rate = char.model, 30.0
+    sim, kin = mujoco.MjData(m), mujoco.MjData(m)
+    bodies = [m.body(n).id for n in char.spec["map"]]
+    joints = sorted({*bodies, m.body("hand_l").id, m.body("hand_r").id})
+    sip = [m.body(f"{part}_{side}").id for part in ("upper_arm", "thigh") for side in "lr"]
+    s = {k: [] for k in KEYS}
+    walked, human_walked, falls, human_falls = 0.0, 0.0, 0, 0
+    for rec in recordings:
+        places, heads, human_heads, soles = [], [], [], []
+        for k, f in enumerate(rec.frames):
+            for data, qpos in ((sim, rec.qpos[k]), (kin, ref.qpos[f])):
+                data.qpos[:] = qpos
+                mujoco.mj_forward(m, data)
+            s["root_cm"].append(100 * np.linalg.norm(sim.qpos[:3] - kin.qpos[:3]))
+            gaps = [100 * np.linalg.norm(sim.site_xpos[char.sensor_sites[i]] - ref.sensor_pos[f, i]) for i in range(3)]
+            s["head_cm"].append(gaps[0])
+            s["hands_cm"] += gaps[1:]
+            for b in joints:
+                off = (sim.xpos[b] - sim.xpos[char.root]) - (kin.xpos[b] - kin.xpos[char.root])
+                s["joint_pos_cm"].append(100 * np.linalg.norm(off))
+            for b in bodies:
+                p = m.body_parentid[b]
+                local = [d.xmat[p].reshape(3, 3).T @ d.xmat[b].reshape(3, 3) for d in (sim, kin)]
+                s["joint_rot_deg"].append(angle(*local))
+            s["sip_deg"] += [angle(sim.xmat[b].reshape(3, 3), kin.xmat[b].reshape(3, 3)) for b in sip]
+            s["head_deg"].append(angle(sim.xmat[char.head].reshape(3, 3), matrix(ref.orientation[f, 1])))
+            places.append([sim.xpos[b].copy() for b in joints])
+            heads.append(sim.xmat[char.head].reshape(3, 3).copy())
+            human_heads.append(matrix(ref.orientation[f, 1]))
+            points = retarget.sole_points(char, sim.geom_xpos[None], sim.geom_xmat[None])[0]  # (2, p, 3)
+            soles.append(points)
+            body_geoms = [g for g in range(m.ngeom) if m.geom(g).name != "floor"]
+            low = character.geom_lowest(m, body_geoms, sim.geom_xpos[None], sim.geom_xmat[None]).min()
+            if low < 0:
+                s["penetration_mm"].append(-1000 * low)
+            if k:
+                s["contact_agreement"] += [float(rec.contact[k, i] == ref.contact[f, i]) for i in range(2)]
+                s["torque_rms"] += list(rec.action[k] ** 2)
+                s["saturation"] += [float(abs(a) > 0.99) for a in rec.action[k]]
+                walked += np.hypot(*(rec.qpos[k] - rec.qpos[k - 1])[:2])
+                human_walked += np.hypot(*(ref.human_pos[f, 0] - ref.human_pos[f - 1, 0])[:2] / ref.scale[f, :2])
+                falls += sum(rec.contact[k, i] and not rec.contact[k - 1, i] for i in range(2))
+                human_falls += sum(ref.contact[f, i] and not ref.contact[f - 1, i] for i in range(2))
+        last = len(rec.frames) - 1
+        for k, f in enumerate(rec.frames):
+            a, b = max(k - 1, 0), min(k + 1, last)
+            for i in range(2):
+                if ref.contact[f, i]:
+                    low = soles[k][i][:, 2].argmin()
+                    s["foot_slide_cm_s"].append(
+                        100 * np.hypot(*(soles[b][i][low] - soles[a][i][low])[:2]) * rate / (b - a)
+                    )
+            both = []
+            for h in (heads, human_heads):
+                turn = h[k].T @ (h[b] @ h[a].T) @ h[k]  # in the head's own axes
+                vector = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+                theta = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
+                scale = theta / (2 * np.sin(theta)) if theta > 1e-7 else 0.5
+                both.append(np.degrees(vector * scale * rate / (b - a)))
+            s["head_wobble_deg_s"] += [(both[0] - both[1])[0] ** 2, (both[0] - both[1])[2] ** 2]
+        x, h = np.array(places), ref.human_pos[rec.frames].astype(float) / ref.scale[rec.frames][:, None]
+        for k in range(len(x) - 3):
+            third = lambda v: np.linalg.norm(v[k + 3] - 3 * v[k + 2] + 3 * v[k + 1] - v[k], axis=-1) * rate**3  # noqa
+            s["jitter_m_s3"] += list(third(x))
+            s["human_jitter_m_s3"] += list(third(h))
+    expected = {k: np.mean(v) for k, v in s.items() if v}
+    expected["head_wobble_deg_s"] **= 0.5
+    expected["torque_rms"] **= 0.5
+    expected |= dict(clips=3, steps_per_m=falls / walked, human_steps_per_m=human_falls / human_walked)
+    expected["completed"] = np.mean([not r.failed for r in recordings])
+    expected["survival"] = np.mean([(len(r.frames) - 1) / (b - a) for r, a, b in zip(recordings, ref.first, ref.last)])
+    assert set(found) == set(KEYS) == set(expected)
+    for key in KEYS:
+        assert found[key] == pytest.approx(expected[key], rel=1e-5, abs=1e-5), key
+        assert expected[key] > 0 or key == "completed", key
+
+
+def test_metrics_of_kinematic(char, ref):
+    """The reference itself: no error against itself; the human's figures are the ones that `mocap` counts."""
+    recordings = play.kinematic(char, ref)
+    assert [len(r.frames) for r in recordings] == [40, 90, 30] and [r.available for r in recordings] == [39, 89, 29]
+    row = metrics.measure(char, ref, recordings)
+    assert row["completed"] == row["survival"] == 1.0 and row["clips"] == 3
+    for key in ("root_cm", "joint_pos_cm", "joint_rot_deg", "sip_deg"):
+        assert row[key] == pytest.approx(0.0, abs=1e-4), key
+    assert row["torque_rms"] == row["saturation"] == 0.0
+    assert row["head_deg"] < 5.0 and row["head_cm"] < 20.0  # what the character's build leaves
+    assert row["contact_agreement"] > 0.7
+    for rec in recordings:  # its contact: height < 2 cm and speed < 0.4 m/s
+        soles = forward_kinematics(char, ref.qpos[rec.frames]).soles
+        for t in range(1, len(rec.frames) - 1):
+            for foot in range(2):
+                low = soles[t, foot, :, 2].argmin()
+                speed = np.hypot(*(soles[t + 1, foot, low] - soles[t - 1, foot, low])[:2]) * 15.0
+                assert rec.contact[t, foot] == (soles[t, foot, low, 2] < 0.02 and speed < 0.4)
+
+    lifted = ref.qpos.copy()
+    lifted[:, 2] += 0.05
+    assert any(r.contact.any() for r in recordings)
+    assert not any(r.contact.any() for r in play.kinematic(char, replace(ref, qpos=lifted)))
+
+
+def test_metrics_on_known_motion(char, ref):
+    still_ref, rec = still(char, ref)
+    nothing = metrics.measure(char, still_ref, [rec])
+    for key in ("root_cm", "head_cm", "hands_cm", "head_deg", "jitter_m_s3", "head_wobble_deg_s", "joint_pos_cm"):
+        assert nothing[key] == pytest.approx(0.0, abs=1e-5), key
+    assert nothing["contact_agreement"] == 1.0
+
+    def changed(f, **more):
+        qpos = rec.qpos.copy()
+        f(qpos)
+        return metrics.measure(char, replace(still_ref, **more), [replace(rec, qpos=qpos)])
+
+    t = np.arange(31) / 30.0
+
+    def aside(q):
+        q[:, 1] += 0.1
+
+    row = changed(aside)  # 10 cm to the side, everything else as it is
+    for key in ("root_cm", "head_cm", "hands_cm"):
+        assert row[key] == pytest.approx(10.0), key
+    for key in ("joint_pos_cm", "joint_rot_deg", "sip_deg", "head_deg"):
+        assert row[key] == pytest.approx(0.0, abs=1e-5), key
+
+    hinge = int(next(h[-1] for b, h, *_ in char.chains if b == char.head))
+
+    def nod(q):
+        q[:, 7 + hinge] += 0.3
+
+    row = changed(nod)  # one hinge of the head by 0.3 rad
+    assert row["head_deg"] == pytest.approx(np.degrees(0.3))
+    assert row["joint_rot_deg"] == pytest.approx(np.degrees(0.3) / len(char.chains))
+    assert row["sip_deg"] == pytest.approx(0.0, abs=1e-5) and row["root_cm"] == 0.0
+    minus = -still_ref.orientation  # q and −q are one rotation
+    assert changed(nod, orientation=minus)["head_deg"] == pytest.approx(np.degrees(0.3))
+
+    arm = int(next(h[-1] for b, h, *_ in char.chains if char.model.body(b).name == "upper_arm_l"))
+
+    def reach(q):
+        q[:, 7 + arm] += 0.4
+
+    assert changed(reach)["sip_deg"] == pytest.approx(np.degrees(0.4) / 4)  # one of two arms and two thighs
+
+    def spin(q):  # the whole body turns with 2 rad/s: yaw, no roll
+        q[:, 3], q[:, 6] = np.cos(t), np.sin(t)
+
+    assert changed(spin)["head_wobble_deg_s"] == pytest.approx(np.degrees(2.0) / np.sqrt(2))
+
+    def bow(q):  # pitch is not wobble
+        q[:, 3], q[:, 5] = np.cos(t / 2), np.sin(t / 2)
+
+    assert changed(bow)["head_wobble_deg_s"] == pytest.approx(0.0, abs=1e-4)
+
+    def cubic(q):
+        q[:, 0] += 0.7 * t**3
+
+    assert changed(cubic)["jitter_m_s3"] == pytest.approx(6 * 0.7, rel=1e-4)  # its third derivative
+    total, count = metrics.jitter((t[:, None, None] ** 3) * [[[1.0, 2.0, 2.0], [0.0, 1.0, 0.0]]], 30.0)
+    assert count == 28 * 2 and total / count == pytest.approx((18.0 + 6.0) / 2)
+
+    contact = np.zeros((31, 2), bool)
+    contact[:, 0] = True
+
+    def glide(q):
+        q[:, 0] += 0.5 * t
+
+    row = changed(glide, contact=contact)  # 0.5 m/s for 1 s, the left foot said to be on the ground
+    assert row["foot_slide_cm_s"] == pytest.approx(50.0)
+    assert np.isnan(changed(glide)["foot_slide_cm_s"])  # no contact, no slide
+
+    lowest = forward_kinematics(char, rec.qpos[:1]).soles[..., 2].min()
+
+    def sink(q):
+        q[:10, 2] -= lowest + 0.005
+        q[10:, 2] += 0.1
+
+    row = changed(sink)
+    assert row["penetration_mm"] == pytest.approx(5.0, abs=1e-6)  # over the ten frames below only
+    assert nothing["penetration_mm"] == pytest.approx(max(0.0, -1000 * lowest), abs=1e-6)
+
+
+def test_steps_contacts_and_torques(char, ref):
+    still_ref, rec = still(char, ref, 11)
+    qpos = rec.qpos.copy()
+    qpos[:, 0] = np.linspace(0.0, 2.0, 11)  # 2 m
+    human = still_ref.human_pos.copy()
+    human[:, 0, 1] = np.linspace(0.0, 4.0, 11)  # 4 m
+    left, right = "00110011100", "11100001111"
+    contact = np.array([[a == "1", b == "1"] for a, b in zip(left, right)])
+    human_contact = np.ones((11, 2), bool)
+    human_contact[3] = False
+    action = np.full((11, len(char.limits)), 0.5)
+    action[0], action[6:] = 7.0, -1.0  # the start's is no action
+    r = replace(still_ref, human_pos=human, contact=human_contact)
+    row = metrics.measure(char, r, [replace(rec, qpos=qpos, contact=contact, action=action)])
+    assert metrics.footfalls(contact) == 3  # left at 2 and 6, right at 7; the right foot stood at the start
+    assert row["steps_per_m"] == pytest.approx(3 / 2.0) and row["human_steps_per_m"] == pytest.approx(2 / 4.0)
+    agree = sum(c == h for c, h in zip(contact[1:].ravel(), human_contact[1:].ravel()))
+    assert row["contact_agreement"] == pytest.approx(agree / 20)
+    assert row["torque_rms"] == pytest.approx(np.sqrt((5 * 0.25 + 5 * 1.0) / 10)) and row["saturation"] == 0.5
+
+
+def test_completed_and_survival(char, ref):
+    still_ref, rec = still(char, ref, 31)
+
+    def cut(k, failed):
+        parts = (v[: k + 1] for v in (rec.frames, rec.qpos, rec.contact, rec.action))
+        return Recording(*parts, failed, 30)
+
+    row = metrics.measure(char, still_ref, [cut(30, False), cut(15, True), cut(6, True), cut(29, True)])
+    assert row["clips"] == 4 and row["completed"] == 0.25
+    assert row["survival"] == pytest.approx((1 + 0.5 + 0.2 + 29 / 30) / 4)
+
+
+def test_nothing_to_measure(char, ref):
+    """A clip that fails in its first step leaves one frame: no division by zero, and no zero that flatters."""
+    still_ref, rec = still(char, ref, 31)
+    one = Recording(rec.frames[:1], rec.qpos[:1], rec.contact[:1], rec.action[:1], True, 30)
+    with np.errstate(all="raise"):
+        row = metrics.measure(char, still_ref, [one])
+        assert row["completed"] == row["survival"] == 0.0 and row["root_cm"] == 0.0 and set(row) == set(KEYS)
+        steps = ("contact_agreement", "jitter_m_s3", "human_jitter_m_s3", "steps_per_m", "human_steps_per_m")
+        for key in (*steps, "foot_slide_cm_s", "head_wobble_deg_s", "torque_rms", "saturation"):
+            assert np.isnan(row[key]), key
+        for count in (2, 3):
+            few = Recording(*(v[:count] for v in (rec.frames, rec.qpos, rec.contact, rec.action)), True, 30)
+            assert np.isnan(metrics.measure(char, still_ref, [few])["jitter_m_s3"])
+    json.loads(metrics.as_json({"policy": row}), parse_constant=lambda c: pytest.fail(c))
+    text = metrics.table({"policy": row})
+    assert "nan" not in text and "inf" not in text and "jitter - m/s³, - steps/m" in text
+
+
+def test_a_real_first_step_failure(char, ref):
+    def thrown(env):
+        env.qpos[:, 0] += 5.0
+        return play.zero_action(env)
+
+    recordings = play.simulate(char, ref, thrown, threads=1)
+    assert all(r.failed and len(r.frames) == 1 for r in recordings)
+    assert not too_far(recordings[0].qpos[:, :3], ref.qpos[recordings[0].frames, :3]).any()
+    row = metrics.measure(char, ref, recordings)
+    assert row["completed"] == row["survival"] == 0.0 and row["root_cm"] == 0.0
+
+
+def test_sip_bodies(char):
+    names = {char.model.body(b).name for b in metrics.sip_bodies(char)}
+    assert names == {"upper_arm_l", "upper_arm_r", "thigh_l", "thigh_r"}
+    for table in ({"sip": ["thigh_l", "wing"]}, {"sip": []}, {}):
+        with pytest.raises(UserError, match=r"jesse.toml: \[metrics\] sip.*thigh_l"):
+            metrics.sip_bodies(replace(char, spec=char.spec | {"metrics": table}))
+
+
+def test_table(char, ref):
+    row = metrics.measure(char, ref, play.kinematic(char, ref))
+    text = metrics.table({"policy": row | {"fails_every_s": float("inf")}, "kinematic": row})
+    lines = text.splitlines()
+    width = len(metrics.COLUMNS) + 1
+    assert [line.count("|") for line in lines[:4]] == [width + 1] * 4
+    cells = [c.strip() for c in lines[3].split("|")]
+    assert cells[1:4] == ["kinematic", "-", "-"] and cells[4 + 1] == "0.0"  # completed by definition: a dash
+    assert "never" in lines[2] and "the human: jitter" in text and "3 sequences" in text
+
+
+def test_comparison(char, ref):
+    """`table` turned round: the same cells, a metric a row and a policy a column."""
+    row = metrics.measure(char, ref, play.kinematic(char, ref))
+    results = {"runs/a": row | {"fails_every_s": float("inf")}, "b.npz": row, "kinematic jesse": row}
+    grid = lambda text: [[c.strip() for c in r.split("|")[1:-1]] for r in text.splitlines() if "|" in r]  # noqa: E731
+    found, turned = grid(metrics.comparison(results)), grid(metrics.table(results))
+    assert found[0] == ["", "runs/a", "b.npz", "kinematic jesse"]
+    found, turned = (np.array([r for r in g if r[0] != "---"]) for g in (found, turned))
+    np.testing.assert_array_equal(found, turned.T)
+    assert found[3].tolist() == ["fails every s", "never", "-", "-"]
+    assert metrics.comparison(results).splitlines()[-1] == metrics.table(results).splitlines()[-1]
+
+
+def test_json():
+    """NaN and infinity are null; everything else stays."""
+    rows = {"a": {"x": float("nan"), "y": float("inf"), "z": 1.5, "n": 2}}
+    clean = json.loads(metrics.as_json(rows), parse_constant=lambda c: pytest.fail(f"{c} is not JSON"))
+    assert clean == {"a": {"x": None, "y": None, "z": 1.5, "n": 2}}
