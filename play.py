@@ -625,6 +625,7 @@ def find_policy(opt: Options):
     shipped = name.with_suffix(".npz") if name.suffix == ".toml" else character.CHARACTERS / f"{name}.npz"
     path = Path(opt.policy) if opt.policy else shipped
     if not path.exists():
+        character.load(str(name))  # a wrong name, or a broken character, is the better complaint
         make = f"python ppo.py --character {name} --out runs/a"
         raise UserError(f"no policy {path}: train one ({make}), then --policy runs/a")
     policy, meta = load_policy(path)

@@ -169,7 +169,7 @@ def test_broken_motion(script, here, capsys):
         assert "bad.bvh" in check(here), text  # in a folder
     bad.unlink()
     (here / "empty").mkdir()
-    assert "no .bvh file" in check(here / "empty")
+    assert "one that holds .bvh or .amc files" in check(here / "empty")
 
 
 @pytest.mark.parametrize("script", RUNS)

@@ -250,6 +250,8 @@ def test_split_and_all(policy_file, monkeypatch):
 def test_which_policy(policy_file, tmp_path, monkeypatch, char, ref):
     with pytest.raises(UserError, match="no policy .*missing.npz: train one .*ppo.py --character jesse"):
         play.main(["--measure", "--policy", str(tmp_path / "missing.npz")])
+    for name in ("jesse.toml", "jesse.xml"):
+        (tmp_path / name).write_bytes((character.CHARACTERS / name).read_bytes())
     monkeypatch.setattr(character, "CHARACTERS", tmp_path)
     with pytest.raises(UserError, match="no policy .*jesse.npz"):
         play.find_policy(play.Options())
@@ -257,6 +259,10 @@ def test_which_policy(policy_file, tmp_path, monkeypatch, char, ref):
     assert play.find_policy(play.Options())[1] == tmp_path / "jesse.npz"  # shipped beside the character
     elsewhere = tmp_path / "mine" / "bob.toml"
     elsewhere.parent.mkdir()
+    with pytest.raises(UserError, match="no character .*mine/bob.toml"):
+        play.find_policy(play.Options(character=str(elsewhere)))
+    elsewhere.write_text((tmp_path / "jesse.toml").read_text())
+    (elsewhere.parent / "jesse.xml").write_bytes((tmp_path / "jesse.xml").read_bytes())
     with pytest.raises(UserError, match="no policy .*mine/bob.npz"):
         play.find_policy(play.Options(character=str(elsewhere)))
     other = Policy(7, 9, 2, (4,), (4,), 0.1, 1.0, np.random.default_rng(0))
