@@ -23,6 +23,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import bvh
 import fetch
@@ -128,19 +129,70 @@ def resize(clip: Clip, height=1.0, arms=1.0, trunk=1.0) -> Clip:
     return replace(clip, name=clip.name + tag, body=clip.body + tag, pos=pos, ball=clip.ball * height)
 
 
+# Another bearing: segment -> standard deviation [rad] of a constant turn about its parent's x, y, z.  ASSUMED: about as
+# far as the mean poses of Bandai's styles lie apart.  Both arms are raised (x), swung forward (y) and turned (z) alike,
+# with a fifth of it of their own; elbows only bend further.
+_BEARING = {"chest": (0.04, 0.10, 0.05), "head": (0.05, 0.12, 0.08), "upper_arm": (0.12, 0.20, 0.10)}
+_ELBOW = 0.5  # rad, standard deviation of a further bend, forward
+
+
+def restyle(clip: Clip, rng: np.random.Generator, swing=(0.5, 1.6), bearing=1.0) -> Clip:
+    r"""The same steps with another bearing: trunk, head and arms carried otherwise, swung more or less.
+
+    Equation  of a segment relative to its parent:  R' = exp(φ) R̄ exp(g log(R̄⁻¹ R)), R̄ its mean over the clip
+    Symbols   φ a constant turn, normal with standard deviations `_BEARING`; g in `swing`, one for the trunk and head,
+              one for the arms
+    Why       styles that were never recorded differ from those that were above all in this; pelvis and legs, and with
+              them the feet's contacts, stay as they are
+    Args      clip, rng; swing : least and most of g; bearing : share of φ, 0 for none
+    Returns   Clip; bones keep their lengths
+    Test      tests/test_mocap.py::test_restyle
+    """
+    rest = dict(zip(SEGMENTS, np.moveaxis(clip.quat, 1, 0)))
+    pos, quat = clip.pos.copy(), clip.quat.copy()
+    trunk, arms = rng.uniform(*swing, 2)
+    both = rng.normal(0.0, _BEARING["upper_arm"])
+    bend = bearing * abs(rng.normal(0.0, _ELBOW))
+    for i, name in enumerate(SEGMENTS):
+        up = PARENTS[i]
+        if up < 0 or name[:-2] in ("thigh", "shin", "foot"):
+            continue
+        own, parent = rest[name], rest[SEGMENTS[up]]
+        local = quat_mul(quat_conj(parent), own)  # (T, 4)
+        phi, g = np.zeros(3), arms
+        if name in ("chest", "head"):
+            phi, g = bearing * rng.normal(0.0, _BEARING[name]), trunk
+        elif name.startswith("upper_arm"):
+            side = 1.0 if name.endswith("_l") else -1.0
+            phi = bearing * (both + 0.2 * rng.normal(0.0, _BEARING["upper_arm"])) * [side, 1.0, side]
+        elif name.startswith("forearm"):
+            phi = np.array([0.0, -bend, 0.0])
+        local = Rotation.from_quat(local, scalar_first=True)
+        mean = local.mean()
+        new = mean * Rotation.from_rotvec(g * (mean.inv() * local).as_rotvec())
+        new = new * Rotation.from_rotvec(phi) if name.startswith("forearm") else Rotation.from_rotvec(phi) * new
+        arm = quat_rotate(quat_conj(parent), clip.pos[:, i] - clip.pos[:, up])  # bone, in the parent's frame
+        pos[:, i] = pos[:, up] + quat_rotate(quat[:, up], arm)
+        quat[:, i] = quat_mul(quat[:, up], new.as_quat(scalar_first=True))
+    return replace(clip, name=f"{clip.name}-restyled", pos=pos, quat=quat_continuous(quat))
+
+
 def augment(
-    clips: list[Clip], rng: np.random.Generator, speed=0.15, height=0.2, arms=0.2, trunk=(0.95, 1.45)
-) -> list[Clip]:
-    """Every clip, and its mirror image at a random speed by a user of random height, arm and trunk length.
+    clips: list[Clip], rng: np.random.Generator, speed=0.15, height=0.2, arms=0.2, trunk=(0.95, 1.45),
+    swing=(0.5, 1.6), bearing=1.0,
+) -> list[Clip]:  # fmt: skip
+    """Every clip, and its mirror image with another bearing at a random speed by a user of random height, arm and trunk
+    length.
 
     Args      speed, height, arms : ranges, as shares: speed in 1 +- speed, and so on; trunk : least and most, not even
-              about 1 because the trunk of Bandai's actor is short (`resize`)
+              about 1 because the trunk of Bandai's actor is short (`resize`); swing, bearing : of `restyle`
     Returns   twice as many clips, the given ones first
     Test      tests/test_mocap.py::test_augment
     """
     draw = lambda r: float(rng.uniform(1.0 - r, 1.0 + r))  # noqa: E731
     users = [(draw(speed), draw(height), draw(arms), float(rng.uniform(*trunk))) for _ in clips]
-    return list(clips) + [resize(warp(mirror(c), v), *user) for c, (v, *user) in zip(clips, users, strict=True)]
+    other = (warp(restyle(mirror(c), rng, swing, bearing), v) for c, (v, *_) in zip(clips, users, strict=True))
+    return list(clips) + [resize(c, *user) for c, (_, *user) in zip(other, users, strict=True)]
 
 
 # ------------------------------------------------------------------------------------ what the user wears, and the feet

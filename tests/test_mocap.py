@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 from scipy.spatial.transform import Rotation, Slerp
 
 import bvh
@@ -859,6 +860,42 @@ def test_resize_trunk():
     np.testing.assert_array_equal(mocap.resize(clip, trunk=1.0).pos, clip.pos)
 
 
+def test_restyle():
+    clip = walk(seed=8)
+    seg = mocap.SEG
+    local = lambda c, a, b: Rotation.from_quat(  # noqa: E731
+        mocap.quat_mul(mocap.quat_conj(c.quat[:, seg[a]]), c.quat[:, seg[b]]), scalar_first=True
+    )
+    a, b = (mocap.restyle(clip, np.random.default_rng(1)) for _ in range(2))
+    np.testing.assert_array_equal(a.pos, b.pos)
+    lower = [seg["pelvis"], *(seg[f"{s}_{side}"] for s in ("thigh", "shin", "foot") for side in "lr")]
+    np.testing.assert_array_equal(a.pos[:, lower], clip.pos[:, lower])
+    np.testing.assert_allclose(a.quat[:, lower], clip.quat[:, lower], atol=1e-15)
+    np.testing.assert_array_equal(mocap.contacts(a), mocap.contacts(clip))
+    for i, up in enumerate(mocap.PARENTS):  # each bone keeps its length and, seen from its parent, its direction
+        if up >= 0:
+            bone = [mocap.quat_rotate(mocap.quat_conj(c.quat[:, up]), c.pos[:, i] - c.pos[:, up]) for c in (a, clip)]
+            np.testing.assert_allclose(*bone, atol=1e-12)
+    assert np.abs(a.pos - clip.pos).max() > 0.05
+    # without a bearing: deviations from the mean are g times as large, the mean stays
+    g = 0.6
+    for parent, name in (("pelvis", "chest"), ("chest", "head"), ("chest", "upper_arm_l"), ("forearm_r", "hand_r")):
+        damped = mocap.restyle(clip, np.random.default_rng(1), (g, g), 0.0)
+        was, now = local(clip, parent, name), local(damped, parent, name)
+        for t in (0, 7, 20):
+            power = scipy.linalg.fractional_matrix_power(was.mean().as_matrix().T @ was[t].as_matrix(), g)
+            np.testing.assert_allclose(now[t].as_matrix(), was.mean().as_matrix() @ power.real, atol=1e-8)
+    # with it alone: a constant turn, before the trunk's and after the elbow's rotation, which only bends further
+    turned = mocap.restyle(clip, np.random.default_rng(1), (1.0, 1.0))
+    for parent, name in (("pelvis", "chest"), ("chest", "upper_arm_r")):
+        extra = (local(turned, parent, name) * local(clip, parent, name).inv()).as_rotvec()
+        np.testing.assert_allclose(extra, extra[:1].repeat(len(extra), 0), atol=1e-9)
+        assert 0 < np.linalg.norm(extra[0]) < 1.5
+    extra = (local(clip, "upper_arm_l", "forearm_l").inv() * local(turned, "upper_arm_l", "forearm_l")).as_rotvec()
+    assert extra[0, 1] < 0 and np.abs(extra[:, [0, 2]]).max() < 1e-9
+    assert_same(mocap.restyle(clip, np.random.default_rng(1), (1.0, 1.0), 0.0), clip)
+
+
 def test_augment():
     clips = [walk(seed=s, name=f"walk_{s}") for s in (8, 9)]
     a, b = (mocap.augment(clips, np.random.default_rng(3)) for _ in range(2))
@@ -872,5 +909,5 @@ def test_augment():
         trunk = other.limb("pelvis", "chest") / clip.limb("pelvis", "chest") / scale
         assert 0.95 <= trunk <= 1.45 and trunk != 1.0
         assert 0.84 <= clip.seconds / other.seconds <= 1.16
-    plain = mocap.augment(clips, np.random.default_rng(3), speed=0, height=0, arms=0, trunk=(1, 1))
+    plain = mocap.augment(clips, np.random.default_rng(3), 0, 0, 0, (1, 1), (1, 1), 0)
     assert_same(plain[2], mocap.mirror(clips[0]))
