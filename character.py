@@ -263,7 +263,7 @@ class _Loader:
         observation=("links",),
         reward=(*TERMS, "fail", "joints", "links"),
         feet=("bodies", "contact_sensors"),
-        sensors=("sites",),
+        sensors=("sites", "scale_z"),
         fall=("bodies",),
         pose=None,
         metrics=("sip",),
@@ -631,13 +631,15 @@ class _Loader:
 
     def root(self):
         m, _ = self.need("model"), self.need("hinges")
-        for key in ("scale_xy", "scale_z"):
+        for table, key, words in (("root", "scale_xy", ()), ("root", "scale_z", ("hip",)),
+                                  ("sensors", "scale_z", ("hip", "headset"))):  # fmt: skip
             with suppress(_Stop):
-                value = self.table("root").get(key, 1.0)
-                if isinstance(value, str) and not (key == "scale_z" and value == "hip"):
-                    self.fail(f"[root] {key} = {value!r}; valid: a number" + (' or "hip"' if key == "scale_z" else ""))
-                if value != "hip" and self.number(f"[root] {key}", value) <= 0:
-                    self.fail(f"[root] {key} = {value!r} must be greater than 0")
+                value = self.table(table).get(key, 1.0)
+                if isinstance(value, str) and value not in words:
+                    valid = " or ".join(["a number", *(f'"{w}"' for w in words)])
+                    self.fail(f"[{table}] {key} = {value!r}; valid: {valid}")
+                if not isinstance(value, str) and self.number(f"[{table}] {key}", value) <= 0:
+                    self.fail(f"[{table}] {key} = {value!r} must be greater than 0")
         root, free = int(self.bodies("root", [self.get("root", "body", str)])[0]), int(m.jnt_bodyid[0])
         if root != free:
             self.fail(f"[root] body = {m.body(root).name!r} must be the body of the free joint, {m.body(free).name!r}")

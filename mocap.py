@@ -217,6 +217,14 @@ def sensors(clip: Clip):
     return clip.pos[:, idx] + quat_rotate(q, np.broadcast_to(SENSOR_OFFSETS, q.shape[:2] + (3,))), q
 
 
+def headset_height(clip: Clip) -> float:
+    """Height of the headset when the user stands upright [m]: hips, trunk and neck stretched, the headset's offset.
+
+    Test      tests/test_retarget.py::test_sensor_scale"""
+    trunk = clip.limb("pelvis", "chest") + clip.limb("chest", "head")
+    return clip.hip_height + trunk + float(SENSOR_OFFSETS[0, 2])
+
+
 def contacts(clip: Clip) -> np.ndarray:
     r"""Human foot contacts  [Reda23 App. A]: height < 0.20 m above the ground and speed < 0.4 m/s.
 

@@ -137,6 +137,32 @@ def root_scale(char: Character, clip: Clip) -> np.ndarray:
     return np.array([xy, xy, z])
 
 
+def headset(char: Character) -> np.ndarray:
+    """Where the character's headset is when it stands at the origin in its default pose.  (3,) [m]
+
+    Test      tests/test_stream.py::test_stand"""
+    data = mujoco.MjData(char.model)
+    data.qpos[2], data.qpos[7:] = char.hip_height, char.default
+    mujoco.mj_kinematics(char.model, data)
+    return data.site_xpos[char.sensor_sites[0]].copy()
+
+
+def sensor_scale(char: Character, clip: Clip) -> np.ndarray:
+    r"""Scale (s_xy, s_xy, s_z) of headset and controller positions  [Reda23 §3.4].
+
+    Equation  s_z = the character's headset height / the user's, both standing upright
+    ASSUMED   the paper has no map for them.  A headset sees no hips: this is what a real user can be measured by
+              (`stream.calibrate` does the same), and a user of any build then wears the headset at the character's
+              head.  With `[sensors] scale_z = "hip"` they go through `root_scale`: a CMU subject's headset is then 11
+              to 20 cm above Jesse's head, Oppy's user's 25 cm below Oppy's eyes
+    Test      tests/test_retarget.py::test_sensor_scale
+    """
+    scale, z = root_scale(char, clip), char.spec["sensors"].get("scale_z", "headset")
+    if z != "hip":
+        scale[2] = headset(char)[2] / mocap.headset_height(clip) if z == "headset" else z
+    return scale
+
+
 def euler_angles(q, axes: str):
     r"""Angles of intrinsic turns about `axes` (1 to 3 letters) that make the rotation q.
 
@@ -228,8 +254,8 @@ class Reference:
     """All that the environment compares with, for F frames of one or more sequences laid end to end.
 
     first, last : (S,) frame indices of each sequence
-    World frame; positions of the human already mapped by `root_scale`; matrices as their first two columns
-    (F, ., 3, 2).
+    World frame; positions of the human already mapped by `root_scale`, of the devices by `sensor_scale`; matrices as
+    their first two columns (F, ., 3, 2).
     """
 
     names: list
@@ -247,6 +273,7 @@ class Reference:
     sensor_quat: np.ndarray  # (F, 3, 4) float64
     human_pos: np.ndarray  # (F, 15, 3) float32
     scale: np.ndarray  # (F, 3) float32, by which the human's positions were multiplied
+    sensor_scale: np.ndarray  # (F, 3) float32, by which the devices' were
     human_rot: np.ndarray  # (F, 15, 3, 2) float32
 
     def __len__(self):
@@ -273,7 +300,7 @@ def reference(char: Character, clips: list[Clip]) -> Reference:
 def _reference_of(char, clip):
     pose = retarget(char, clip)
     fk = forward_kinematics(char, pose.qpos, pose.qvel)
-    scale = root_scale(char, clip)
+    scale, size = root_scale(char, clip), sensor_scale(char, clip)
     sensor_pos, sensor_quat = mocap.sensors(clip)
     f32 = np.float32
     return dict(
@@ -283,11 +310,12 @@ def _reference_of(char, clip):
         link_vel=fk.velocity[:, char.reward_links].astype(f32),
         orientation=rest_offset(char, clip.quat[:, [SEG["pelvis"], SEG["head"]]]),
         contact=mocap.contacts(clip),
-        sensor_pos=sensor_pos * scale,
+        sensor_pos=sensor_pos * size,
         sensor_rot=quat_matrix(sensor_quat)[..., :2].astype(f32),
         sensor_quat=sensor_quat,
         human_pos=(clip.pos * scale).astype(f32),
         scale=np.tile(scale, (len(clip), 1)).astype(f32),
+        sensor_scale=np.tile(size, (len(clip), 1)).astype(f32),
         human_rot=quat_matrix(clip.quat)[..., :2].astype(f32),
     )
 

@@ -29,13 +29,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 
 from character import Character, geom_lowest
 from env import BAD, SUBSTEPS, fallen, observation_terms, observe, slices_of
 from mocap import CONTROL_RATE, heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate, quat_slerp
-from retarget import STAGE_VEL, Reference
+from retarget import STAGE_VEL, Reference, headset
 from runs import UserError, parse_number
 
 DEVICES = ("head", "left", "right")
@@ -255,14 +254,14 @@ NEUTRAL = np.array([[0.0, 0.0, 0.0], [-0.04, 0.26, -0.90], [-0.04, -0.26, -0.90]
 def controllers_hang(ref: Reference) -> Reference:
     r"""The reference with controllers that hang beside the user, wherever the headset goes  [Reda23 §4.2].
 
-    Equation  p_i = p_head + s ⊙ R_z(ψ) n_i,  R_i = R_z(ψ): ψ the headset's heading, s the reference's scale, n NEUTRAL
+    Equation  p_i = p_head + s ⊙ R_z(ψ) n_i,  R_i = R_z(ψ): ψ the headset's heading, s `retarget.sensor_scale`, n NEUTRAL
     Why       how a policy that was trained with three devices is driven with one.  ASSUMED: §4.2 does not say; it is
               also what `Guard` gives for controllers that were never seen
     Test      tests/test_stream.py::test_controllers_hang
     """
     turn = quat_about(2, heading(ref.sensor_quat[:, 0]))[:, None]  # (F, 1, 4)
     pos, quat = ref.sensor_pos.copy(), ref.sensor_quat.copy()
-    pos[:, 1:] = pos[:, :1] + ref.scale[:, None] * quat_rotate(turn, NEUTRAL[1:])
+    pos[:, 1:] = pos[:, :1] + ref.sensor_scale[:, None] * quat_rotate(turn, NEUTRAL[1:])
     quat[:, 1:] = turn
     return replace(ref, sensor_pos=pos, sensor_quat=quat, sensor_rot=quat_matrix(quat)[..., :2].astype(np.float32))
 
@@ -525,7 +524,7 @@ AVERAGE = 1.64  # m, headset of a user of 1.75 m, taken where the floor is not k
 
 @dataclass(frozen=True)
 class Calibration:
-    """The user's world -> the character's: p' = s ⊙ R_z(−yaw) (p − origin), as `retarget.root_scale` maps positions.
+    """The user's world -> the character's: p' = s ⊙ R_z(−yaw) (p − origin), s as `retarget.sensor_scale`.
 
     Test      tests/test_stream.py::test_calibration
     """
@@ -563,16 +562,6 @@ def calibrate(char: Character, pos, quat, user_height: float | None = None) -> C
     origin = np.array([*np.median(pos[:, :2], axis=0), top - height])
     xy = char.spec["root"].get("scale_xy", 1.0)
     return Calibration(height, top - height, estimated, yaw, origin, np.array([xy, xy, headset(char)[2] / height]))
-
-
-def headset(char: Character) -> np.ndarray:
-    """Where the character's headset is when it stands at the origin in its default pose.  (3,) [m]
-
-    Test      tests/test_stream.py::test_stand"""
-    data = mujoco.MjData(char.model)
-    data.qpos[2], data.qpos[7:] = char.hip_height, char.default
-    mujoco.mj_kinematics(char.model, data)
-    return data.site_xpos[char.sensor_sites[0]].copy()
 
 
 class Stream:

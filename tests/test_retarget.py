@@ -14,7 +14,7 @@ import gait
 import mocap
 import render
 import retarget
-from mocap import SEG, Clip
+from mocap import PARENTS, SEG, SEGMENTS, Clip
 from runs import UserError
 
 ALL_THREE = ("chest", "head", "upper_arm_l", "upper_arm_r", "thigh_l", "thigh_r")  # segments with three hinges or more
@@ -369,6 +369,29 @@ def test_euler_angles_go_on():
     np.testing.assert_allclose(retarget.euler_angles(around, "z")[:, 0], 4.5 * np.pi * t, atol=1e-6)
 
 
+def test_sensor_scale(char, mini):
+    """A user who stands upright wears the headset as high as the character, whatever the proportions."""
+    for body in ({}, {"height": 1.2}, {"trunk": 1.3}, {"arms": 0.8}):
+        clip = mocap.resize(clip_of("walk", height=1.6), **body)
+        q = np.tile([1.0, 0, 0, 0], (len(clip), 15, 1))
+        pos = clip.pos.copy()
+        pos[:, 0] = [0.0, 0.0, clip.hip_height]
+        for i, parent in enumerate(PARENTS):  # upright: every bone of the trunk vertical
+            if SEGMENTS[i] in ("chest", "head"):
+                pos[:, i] = pos[:, parent] + [0.0, 0.0, clip.limb(SEGMENTS[parent], SEGMENTS[i])]
+        upright = dataclasses.replace(clip, pos=pos, quat=q)
+        top = mocap.sensors(upright)[0][0, 0, 2] * retarget.sensor_scale(char, clip)
+        d = posed(char.model, np.concatenate([[0, 0, char.hip_height], char.rest[char.root], char.default]))
+        np.testing.assert_allclose(top[2], d.site_xpos[char.sensor_sites[0], 2], rtol=1e-6)
+        np.testing.assert_array_equal(top[:2] > 0, True)
+    with_hip = character.load("jesse", set=('sensors.scale_z="hip"',))
+    np.testing.assert_array_equal(retarget.sensor_scale(with_hip, clip), retarget.root_scale(char, clip))
+    fixed = character.load("jesse", set=("sensors.scale_z=0.7",))
+    np.testing.assert_allclose(retarget.sensor_scale(fixed, clip), [1, 1, 0.7])
+    with pytest.raises(UserError, match=r'\[sensors\] scale_z = "?.?eyes.*valid: a number or "hip" or "headset"'):
+        character.load("jesse", set=('sensors.scale_z="eyes"',))
+
+
 def test_root_scale(char, mini):
     """Travel as it is, height by the legs; numbers from the TOML where given."""
     clip = clip_of("walk", height=1.6)
@@ -482,7 +505,7 @@ def test_reference(char, mini, clips):
                 np.testing.assert_allclose(ref.link_vel[f, i], out[3:], atol=1e-5)
             for i, (s, offset) in enumerate(zip(("head", "hand_l", "hand_r"), mocap.SENSOR_OFFSETS, strict=True)):
                 turn = rotation(clip.quat[t, SEG[s]])
-                where = (clip.pos[t, SEG[s]] + turn.apply(offset)) * scale  # the same map as the root
+                where = (clip.pos[t, SEG[s]] + turn.apply(offset)) * retarget.sensor_scale(char, clip)
                 np.testing.assert_allclose(ref.sensor_pos[f, i], where, atol=1e-9)
                 np.testing.assert_allclose(ref.sensor_rot[f, i], turn.as_matrix()[:, :2], atol=1e-6)
                 np.testing.assert_allclose(rotation(ref.sensor_quat[f, i]).as_matrix(), turn.as_matrix(), atol=1e-9)

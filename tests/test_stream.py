@@ -458,7 +458,7 @@ def test_controllers_hang(jesse, walk):
     out, guard = guarded(lost)
     assert guard.events["left", "not finite"] == 1
     for k, sample in enumerate(out):
-        np.testing.assert_allclose(hang.sensor_pos[k], sample.pos * ref.scale[k], atol=1e-6)
+        np.testing.assert_allclose(hang.sensor_pos[k], sample.pos * ref.sensor_scale[k], atol=1e-6)
         assert quat_angle(hang.sensor_quat[k], sample.quat).max() < 1e-6
     np.testing.assert_array_equal(hang.sensor_pos[:, 0], ref.sensor_pos[:, 0])
     np.testing.assert_array_equal(hang.sensor_rot[:, 0], ref.sensor_rot[:, 0])
