@@ -130,9 +130,10 @@ def bench(char, ref, opt: Options) -> dict:
 def policy_step(char, ref, policy, n=2000):
     """Milliseconds to observe and infer for one character, the latency a headset would see: median, 99th percentile.
 
+    What only the critic sees is left out: it is not there when playing.
     Test: tests/test_bench.py::test_bench_json
     """
-    env = Env(char, ref, 1, threads=1)
+    env = Env(char, ref, 1, threads=1, asymmetric=False)
     env.reset()
     times = []
     for _ in range(n):

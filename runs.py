@@ -117,7 +117,8 @@ def cli(dataclass_type, argv, prog, description):
     Raises    SystemExit: 0 after --help; 2 after one line about an unknown flag or a bad value
     Test      tests/test_runs.py::test_cli_reads_every_kind, test_cli_refuses
     """
-    parser = argparse.ArgumentParser(prog=prog, description=description, allow_abbrev=False)
+    raw = argparse.RawDescriptionHelpFormatter  # the commands of a module's first lines stay lines
+    parser = argparse.ArgumentParser(prog=prog, description=description, allow_abbrev=False, formatter_class=raw)
     parser.error = lambda message: parser.exit(2, f"{prog}: error: {message} (see --help)\n")
     hints, fields = typing.get_type_hints(dataclass_type), dataclasses.fields(dataclass_type)
     flags = {f.name: f.metadata.get("flag") or "--" + f.name.replace("_", "-") for f in fields}
