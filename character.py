@@ -259,7 +259,7 @@ class _Loader:
         root=("body", "scale_xy", "scale_z"),
         map=None,
         torque=("base", "scale"),
-        passive=("stiffness", "damping", "armature"),
+        passive=("stiffness", "damping", "armature", "hold"),
         observation=("links",),
         reward=(*TERMS, "fail", "joints", "links"),
         feet=("bodies", "contact_sensors"),
@@ -600,7 +600,9 @@ class _Loader:
     def springs(self):
         """Spring, damper (a multiple of the spring) and armature of every hinge that the MJCF drives.
 
-        The others (tails, ears) keep what the MJCF gives them.  All are scaled as `load` says."""
+        The others (tails, ears) keep what the MJCF gives them.  All are scaled as `load` says.  Those of the joints in
+        `hold` are stretched so far that they bear in the default pose what hangs on them, as the ligament in a long
+        neck does: q_spring = q_default + moment of the weight / stiffness."""
         m, names, driven, s = self.need("model"), self.need("hinges"), self.need("driven"), self.size
         before = len(self.problems)
         m.jnt_stiffness[1:] *= s**4
@@ -628,6 +630,16 @@ class _Loader:
                 mujoco.mj_setConst(m, mujoco.MjData(m))
             except Warning as e:
                 self.fail_xml(f"{e}; expected masses and inertias that can be moved")
+        held = self.table("passive").get("hold", [])
+        if not isinstance(held, list) or not {str(g) for g in held} <= groups | {numberless(g) for g in groups}:
+            there = ", ".join(sorted(groups)) or "none"
+            self.fail(f"[passive] hold = {held!r} must list driven joints; there are {there}")
+        data = mujoco.MjData(m)
+        data.qpos[7:] = self.need("default")
+        mujoco.mj_forward(m, data)
+        for h in own:
+            if {joint_group(names[h]), numberless(joint_group(names[h]))} & set(held) and m.jnt_stiffness[1 + h] > 0:
+                m.qpos_spring[7 + h] += data.qfrc_bias[6 + h] / m.jnt_stiffness[1 + h]
 
     def root(self):
         m, _ = self.need("model"), self.need("hinges")

@@ -254,7 +254,7 @@ NEUTRAL = np.array([[0.0, 0.0, 0.0], [-0.04, 0.26, -0.90], [-0.04, -0.26, -0.90]
 def controllers_hang(ref: Reference) -> Reference:
     r"""The reference with controllers that hang beside the user, wherever the headset goes  [Reda23 §4.2].
 
-    Equation  p_i = p_head + s ⊙ R_z(ψ) n_i,  R_i = R_z(ψ): ψ the headset's heading, s `retarget.sensor_scale`, n NEUTRAL
+    Equation  p_i = p_head + s ⊙ R_z(ψ) n_i,  R_i = R_z(ψ): ψ the headset's heading, s the devices' scale, n NEUTRAL
     Why       how a policy that was trained with three devices is driven with one.  ASSUMED: §4.2 does not say; it is
               also what `Guard` gives for controllers that were never seen
     Test      tests/test_stream.py::test_controllers_hang

@@ -107,7 +107,7 @@ def test_torques_and_springs_in_the_model(which, rng, mini, chars):
     table = spec["stiffness"]
     groups = [c.hinges[h].split("_")[0] for h in c.driven]
     k = np.array([table.get(g, table.get(g.rstrip("0123"), table.get("default"))) for g in groups])
-    want = -k * (q - c.default[c.driven]) - spec["damping"] * k * v
+    want = -k * (q - m.qpos_spring[7:][c.driven]) - spec["damping"] * k * v
     np.testing.assert_allclose(d.qfrc_passive[6:][c.driven], want, rtol=1e-9, atol=1e-9)
     for ctrl, force in ((1.0, 1.0), (-0.5, -0.5)):
         d.ctrl[:] = ctrl
@@ -116,6 +116,26 @@ def test_torques_and_springs_in_the_model(which, rng, mini, chars):
     if which == "mini":  # the tail keeps the MJCF's stiffness; its spring pulls to the default pose
         k = c.hinges.index("tail_y")
         assert d.qfrc_passive[6 + k] == pytest.approx(-3.0 * (qpos[7 + k] - 0.7))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_springs_hold_the_default_pose(chars, name):
+    """A spring in `hold` cancels the weight in the default pose; the others rest there."""
+    c = chars[name]
+    held = [h for h in c.driven if {c.hinges[h].split("_")[0], character.numberless(c.hinges[h].split("_")[0])}
+            & set(c.spec["passive"].get("hold", ()))]  # fmt: skip
+    assert bool(held) == (name == "dino")
+    d = posed(c.model, np.concatenate([[0, 0, 2, 1, 0, 0, 0], c.default]), np.zeros(c.model.nv))
+    force = d.qfrc_passive - d.qfrc_bias
+    assert not held or np.abs(d.qfrc_bias[6:][held]).max() > 50
+    np.testing.assert_allclose(force[6:][held], 0.0, atol=1e-9)
+    rest = np.setdiff1d(np.arange(c.j), held)
+    np.testing.assert_array_equal(c.model.qpos_spring[7:][rest], c.default[rest])
+
+
+def test_hold_names_driven_joints():
+    with pytest.raises(UserError, match=r"\[passive\] hold = \['wing'\] must list driven joints; there are .*tail0"):
+        character.load("dino", set=("passive.hold=['wing']",))
 
 
 @pytest.mark.parametrize("name", NAMES)
