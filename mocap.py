@@ -334,10 +334,9 @@ def _stitch_body(group, rng, seconds, limit, blend, stay, report):
         d[(owner == clip) & (np.abs(frame - at) < keep)] = np.inf  # not back to where it is
         if not len(d) or d.min() > limit:
             return None
-        visits = np.concatenate([p[e] for p, e in zip(played, entries, strict=True)])
-        score = np.where(d <= limit, d * (1.0 + visits), np.inf)
-        pick = np.argsort(score, kind="stable")[:3]  # a choice among the best three: variety
-        pick = pick[np.isfinite(score[pick])]
+        near = np.flatnonzero(d <= limit)
+        visits = np.array([played[owner[k]][frame[k]] for k in near])
+        pick = near[np.argsort(d[near] * (1.0 + visits), kind="stable")[:3]]  # among the best three: variety
         k = int(rng.choice(pick))
         return int(owner[k]), int(frame[k]), float(d[k])
 

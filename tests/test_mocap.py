@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 import bvh
 import gait
+import human
 import mocap
 import rigs
 from mocap import FEET, PARENTS, RIGS, SEG, SEGMENTS, Clip
@@ -128,6 +129,7 @@ def test_quaternions():
         np.testing.assert_allclose(mocap.quat_matrix(sign * a), rot(a).as_matrix(), atol=1e-12)
         np.testing.assert_allclose(mocap.quat_angle(sign * a, b), (rot(a) * rot(b).inv()).magnitude(), atol=1e-12)
         assert mocap.quat_angle(sign * a, a).max() < 1e-7
+    np.testing.assert_array_equal(human.cross(a[:, 1:], v), np.cross(a[:, 1:], v))
     product = rot(mocap.quat_mul(a, b)).as_matrix()
     np.testing.assert_allclose(product, (rot(a) * rot(b)).as_matrix(), atol=1e-12)
     np.testing.assert_allclose(rot(mocap.quat_conj(a)).as_matrix(), rot(a).inv().as_matrix(), atol=1e-12)
