@@ -8,6 +8,7 @@ collide      two characters, each an obstacle to the other         tilt         
 follow       a direction that turns every 4 s, 1.2 and 2.5 m/s,    stiff-knee   a strong spring from hip to heel
              and led by the hand                                   ragdoll      no prior
 backflip     a clip until the push, then the prior                 wrench       the root wrench of motions (Fig. 7)
+weights      a table: weights against 1/h²
 all          every one of them
 
 Red: forces from outside.  Blue: the contact forces of Eq. 11.  `fell` is a pelvis below 0.6 of its standing height, or
@@ -16,8 +17,10 @@ a trunk more than 60 degrees from the vertical, at the end or for half a second.
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -171,6 +174,10 @@ class Stage:
         self.opt, self.clips = opt, motions(opt)
         self.nearest = NearestPrior([c[1:] for c in self.clips]) if opt.prior == "nearest" else None
 
+    def again(self):
+        """A generator with the seed of the options: takes that are compared draw the same numbers."""
+        return np.random.default_rng(self.opt.seed)
+
     def prior(self, x, quat, at):
         """The prior asked for; a clip's prior follows the clip the take starts from."""
         return {"nearest": self.nearest, "clip": ClipPrior(x, quat, at), "none": None}[self.opt.prior]
@@ -222,6 +229,8 @@ def push(stage, rng):
     """§8.1: a sideways push of 0.27 s on torso, hand or foot of a walker and of a runner (--prior clip: tracked)."""
     takes = []
     for speed, word in ((1.2, "walk"), (2.5, "run")):
+        sim, state = stage.start(speed)
+        undisturbed = _centres(single("", sim, state, 180, stage.again(), lambda t, state: (None, {}, ())))
         for where, (joint, small, large) in PUSHES.items():
             for size, newton in (("small", small), ("large", large)):
                 if word == "run" and where != "torso":
@@ -229,11 +238,23 @@ def push(stage, rng):
                 sim, state = stage.start(speed)
                 left = quat_rotate(quat_about(2, heading(state.quat[0])), np.array([0.0, 1.0, 0.0]))
                 act = _pushing(joint, newton * left)
-                take = single(f"{word} {where} {size} {newton:.0f} N", sim, state, 180, rng, act)
+                take = single(f"{word} {where} {size} {newton:.0f} N", sim, state, 180, stage.again(), act)
                 take.window = (30, 94)
+                take.notes["away from the unpushed take"] = _displacement(take, undisturbed)
                 take.notes["impulse"] = f"{newton * np.diff(PUSH_FRAMES)[0] * STEP:.0f} N s on {N} kg"
                 takes.append(take)
     return takes
+
+
+def _centres(take):
+    """Centre of mass on the floor (T, 2) of a take's first character."""
+    return np.array([s[0].com[:2] for s in take.states])
+
+
+def _displacement(take, undisturbed):
+    away = 100 * np.linalg.norm(_centres(take) - undisturbed, axis=1)
+    later = away[: PUSH_FRAMES[1] + round(1 / STEP)][-1]
+    return f"{away[PUSH_FRAMES[1] - 1]:.1f} cm when the push ends, {later:.1f} 1 s later"
 
 
 def _pushing(joint, vector, frames=PUSH_FRAMES):
@@ -306,7 +327,7 @@ def projectiles(stage, rng):
     takes = []
     for dodge in (False, True):
         sim, state = stage.start(1.2)
-        balls, seen = [], set()
+        balls, seen = [], {}
         sides = np.radians([90, -60, 180, 30, -120, 100])
 
         def act(t, state, balls=balls, sides=sides, seen=seen, dodge=dodge):
@@ -320,13 +341,15 @@ def projectiles(stage, rng):
             for i, ball in enumerate(balls):
                 f = ball.frame(state)
                 if np.abs(f).max() > 1:
-                    seen.add(i)
+                    seen.setdefault(i, t)
                 force += f
             v = escape(state, balls) if dodge else None
             return force, {"v_tar": v}, [(b.x, b.radius, (0.9, 0.6, 0.1, 1)) for b in balls]
 
         take = single("projectiles" + (" dodging" if dodge else ""), sim, state, 210, rng, act)
         take.notes["balls that hit"] = f"{len(seen)} of {len(balls)}"
+        first = min(seen.values(), default=50)  # the sheet: every other frame around one hit, or one ball's flight
+        take.window = (first - 4, first + 12) if seen else (first - 20, first + 12)
         takes.append(take)
     return takes
 
@@ -348,6 +371,7 @@ def collide(stage, rng):
             apart = np.linalg.norm(states[0].x[:, None] - states[1].x, axis=-1) - RADII[:, None] - RADII
             nearest = min(nearest, float(apart.min()))
             take.add(states, [o for _, o in steps])
+        take.window = (15, 75)
         take.notes["deepest overlap of the two"] = f"{max(-100 * nearest, 0):.1f} cm"
         takes.append(take)
     return takes
@@ -362,9 +386,12 @@ def follow(stage, rng):
     return [_follow(stage, rng, speed, led) for speed, led in ((1.2, False), (2.5, False), (1.2, True), (2.5, True))]
 
 
+LEAD_STIFFNESS, LEAD_LIMIT = 200.0, 40.0  # N/m, N, ASSUMED: the hand that leads
+
+
 def _follow(stage, rng, speed, led, frames=480):
     sim, state = stage.start(speed)
-    yaw, ahead = heading(state.quat[0]), 0.6 * speed
+    yaw, ahead, reach = heading(state.quat[0]), 0.6 * speed, []
     way = lambda t: yaw + (t * STEP // 4) * np.pi / 2  # noqa: E731
     dot = state.com[:2] + ahead * np.array([np.cos(yaw), np.sin(yaw)])
 
@@ -375,10 +402,11 @@ def _follow(stage, rng, speed, led, frames=480):
         far = np.linalg.norm(gap)
         v = speed * gap / max(far, 1e-9) * min(far / ahead, 1.25)
         force = None
-        if led:  # the hand is drawn half an arm's length towards the dot, by at most 8 N
+        if led:  # the hand is drawn to a place half a metre towards the dot
             place = np.append(state.com[:2] + 0.5 * gap / max(far, 1e-9), 1.1)
-            pull = 40.0 * (place - state.x[J["wrist_r"]])
-            force = one_force("wrist_r", pull * min(1.0, 8.0 / max(np.linalg.norm(pull), 1e-9)))
+            pull = LEAD_STIFFNESS * (place - state.x[J["wrist_r"]])
+            force = one_force("wrist_r", pull * min(1.0, LEAD_LIMIT / max(np.linalg.norm(pull), 1e-9)))
+            reach.append(np.linalg.norm(place - state.x[J["wrist_r"]]))
         return force, {"v_tar": v}, [(np.append(dot, 0.06), 0.06, (0.9, 0.1, 0.1, 1))]
 
     take = single(f"follow {speed} m/s" + (" led by the hand" if led else ""), sim, state, frames, rng, act)
@@ -393,6 +421,8 @@ def _follow(stage, rng, speed, led, frames=480):
     take.notes["2 s after each turn"] = (
         f"{along:.2f} m/s along the dot's way, heading off by {np.degrees(off[late].mean()):.0f} degrees"
     )
+    if led:
+        take.notes["hand to the place it is led to"] = f"{100 * np.mean(reach):.0f} cm on average"
     return take
 
 
@@ -609,23 +639,81 @@ def wrench(stage, rng):
     for correction in (False, True):
         sim, state = stage.start(2.5)
         sim.correction = correction
+        undisturbed = _centres(single("", sim, state, 120, stage.again(), lambda t, state: (None, {}, ())))
         act = _pushing("spine3", np.array([0.0, 120.0, 0.0]))
-        take = single(f"run pushed {'' if correction else 'un'}corrected", sim, state, 120, rng, act)
+        take = single(f"run pushed {'' if correction else 'un'}corrected", sim, state, 120, stage.again(), act)
         take.window = (30, 94)
-        after = slice(PUSH_FRAMES[0], PUSH_FRAMES[0] + 30)
-        before, left = (np.array([getattr(o[0], n) for o in take.outcomes])[after] for n in ("wrench_pd", "wrench"))
-        take.notes["root wrench in the second after the push"] = (
-            f"solved {np.median(before):.0f} (95 %: {np.percentile(before, 95):.0f}), "
-            f"in the motion {np.median(left):.0f} ({np.percentile(left, 95):.0f})"
-        )
+        pd, left = (np.array([getattr(o[0], n) for o in take.outcomes]) for n in ("wrench_pd", "wrench"))
+        for word, part in (("whole take", slice(None)), ("second from the push on", slice(30, 60))):
+            take.notes[f"root wrench, {word}"] = (
+                f"solved: median {np.median(pd[part]):.0f}, 95 % {np.percentile(pd[part], 95):.0f}; "
+                f"in the motion: {np.median(left[part]):.0f}, {np.percentile(left[part], 95):.0f}"
+            )
+        take.notes["away from the unpushed take"] = _displacement(take, undisturbed)
         takes.append(take)
     return takes
+
+
+SCALES = ((1, 3), (3, 9), (10, 30), (100, 3), (30, 9), (300, 9))  # w_1, and w_2, w_3, w_kin, of `weights`
+
+
+def weights(stage, rng):
+    """REPRODUCE.md's table of weights against 1/h²; prints, and has no take.
+
+    Columns   bone: largest error before lengths are restored, 100 N for 0.27 s on a walker's torso; hand: how far 100 N
+              move it by then; swing, period: the forearm released at 60 degrees from a held elbow, after 1/3 s; alone:
+              its bone error without restoring; walk, run: speed and foot slide of 3 s unperturbed
+    Test      tests/test_drop_demos.py::test_weights
+    """
+    print("w_1; others   bone     hand   swing   period    alone    walk          run")
+    nothing = lambda t, state: (None, {}, ())  # noqa: E731
+    for rigid, other in SCALES:
+        w = drop.Weights(rigid, other, other, other)
+        sim, state = stage.start(1.2, weights=w)
+        left = quat_rotate(quat_about(2, heading(state.quat[0])), np.array([0.0, 100.0, 0.0]))
+        torso, hand, free = (single("", sim, state, 18, stage.again(), act) for act in (
+            _pushing("spine3", left, (10, 18)), _pushing("wrist_l", left, (10, 18)), nothing))  # fmt: skip
+        bone = max(o[0].bone_error for o in torso.outcomes)
+        moved = np.linalg.norm((hand.states[-1][0].x - free.states[-1][0].x)[J["wrist_l"]])
+        (angle, _), (_, alone) = forearm(w), forearm(w, restore=False)
+        cross = np.flatnonzero(angle[:-1] * angle[1:] < 0)
+        at = cross + angle[cross] / (angle[cross] - angle[cross + 1])
+        gaits = []
+        for speed in (1.2, 2.5):
+            sim, state = stage.start(speed, weights=w)
+            gaits += measure(single("", sim, state, 90, stage.again(), nothing))
+        print(
+            f"{rigid:3d}; {other:3d}     {100 * bone:5.1f} %  {100 * moved:4.0f} cm  "
+            f"{np.degrees(angle[0] - angle[10]):4.1f}°  {2 * STEP * np.diff(at).mean():.3f} s  {100 * alone:5.2f} %   "
+            + "   ".join(f"{r['speed']:.2f}, {r['slide']:.2f}" for r in gaits)
+        )
+    return []
+
+
+def forearm(w, degrees=60.0, restore=True, steps=60):
+    """The left forearm swinging from a held elbow: angles (steps + 1,) [rad], largest relative error of the bone.
+
+    Test: tests/test_drop_demos.py::test_weights"""
+    sim = Simulator(None, weights=replace(w, constraint=1e5), contact=False, limits=None, restore=restore)
+    rest = np.tile([1.0, 0.0, 0.0, 0.0], (N, 1))
+    x, e, k = drop.forward_kinematics(drop.OFFSETS[0], rest), J["elbow_l"], J["wrist_l"]
+    theta = np.radians(degrees)
+    x[k] = x[e] + LENGTHS[k - 1] * np.array([np.sin(theta), 0.0, -np.cos(theta)])
+    pins = {j: x[j].copy() for j in range(N) if j != k}
+    state, angles, worst = sim.begin(x, rest), [theta], 0.0
+    for _ in range(steps):
+        state, _ = sim.step(state, pins=pins)
+        bone = state.x[k] - state.x[e]
+        angles.append(np.arctan2(bone[0], -bone[2]))
+        worst = max(worst, abs(np.linalg.norm(bone) / LENGTHS[k - 1] - 1))
+    return np.array(angles), worst
 
 
 DEMOS = {
     "push": push, "projectiles": projectiles, "collide": collide, "follow": follow, "constrain": constrain,
     "trip": trip,
     "tilt": tilt, "stiff-knee": stiff_knee, "ragdoll": ragdoll, "wrench": wrench, "backflip": backflip,
+    "weights": weights,
 }  # fmt: skip
 
 
@@ -652,16 +740,25 @@ def body_shapes(x, rgba):
     return shapes + [render.Marker(x[J["head"]] + [0, 0, 0.02], None, rgba, 0.1)]
 
 
-def arrow(place, vector, rgba, scale=0.005, longest=0.8):
-    """A force as an arrow that ends at `place`.  Test: tests/test_drop_demos.py::test_shapes_and_arrows"""
+def arrow(place, vector, rgba, scale=0.005, longest=0.8, leaves=False):
+    """A force as an arrow that ends at `place`; or that leaves it, as a floor's does, which would be hidden below.
+
+    Test: tests/test_drop_demos.py::test_shapes_and_arrows, ::test_contact_forces_are_drawn_above_the_floor"""
     v = scale * np.asarray(vector)
     v = v * min(1.0, longest / max(np.linalg.norm(v), 1e-9))
     if np.linalg.norm(v) < 0.02:
         return []
+    place = place + v if leaves else place
     return [
         render.Bone(place - v, place - 0.12 * v, rgba, 0.012),
         render.Bone(place - 0.2 * v, place - 0.1 * v, rgba, 0.03),
     ]
+
+
+def contact_arrows(found):
+    """An Outcome's contact forces.  Test: tests/test_drop_demos.py::test_contact_forces_are_drawn_above_the_floor"""
+    arrows = (arrow(p, f, (0.1, 0.2, 0.9, 1.0), 0.002, leaves=True) for p, f in zip(found.points, found.forces))
+    return [shape for shapes in arrows for shape in shapes]
 
 
 def draw(scene, data, take, t):
@@ -674,8 +771,7 @@ def draw(scene, data, take, t):
     shapes, centre = [], np.mean([s.com for s in take.states[t]], axis=0)
     for k, (state, found) in enumerate(zip(take.states[t], take.outcomes[t])):
         shapes += body_shapes(state.x, COLOURS[k % 2])
-        for p, f in zip(found.points, found.forces):
-            shapes += arrow(p, f, (0.1, 0.2, 0.9, 1.0), 0.002)
+        shapes += contact_arrows(found)
     for p, f in take.arrows[t]:
         shapes += arrow(p, f, (0.9, 0.1, 0.1, 1.0), 0.008)
     shapes += [
@@ -684,7 +780,8 @@ def draw(scene, data, take, t):
     camera = mujoco.MjvCamera()
     ground = (floor.offset - floor.normal[:2] @ centre[:2]) / floor.normal[2]
     camera.lookat[:] = [centre[0], centre[1], 0.8 + ground]
-    camera.distance, camera.azimuth, camera.elevation = (3.2 if len(take.states[t]) == 1 else 4.2), 130, -14
+    apart = max(np.linalg.norm(s.com - centre) for s in take.states[t])
+    camera.distance, camera.azimuth, camera.elevation = (4.0 if apart else 3.2) + 2.0 * apart, 130, -14
     return scene.frame(data, camera, shapes)
 
 
@@ -694,6 +791,7 @@ def write_pictures(takes, opt, columns=9):
     data = mujoco.MjData(model)
     if opt.png:
         scene = render.Scene(model, 240, 300, camera=mujoco.MjvCamera(), fast=True)
+        scene.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = True  # they show which foot stands
         frames, labels = [], []
         for take in takes:
             shown = np.linspace(*(take.window or (0, len(take.states) - 1)), columns).round().astype(int)
@@ -714,16 +812,31 @@ def write_pictures(takes, opt, columns=9):
         print(opt.video)
 
 
+def check_outputs(opt):
+    """Can the pictures be written?  Before the slow work.
+
+    Test: tests/test_drop_demos.py::test_outputs_are_checked_first"""
+    for path in map(Path, filter(None, (opt.png, opt.video))):
+        if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+            raise UserError(f"cannot write {path}: give a file in a folder that exists and is writable")
+    if opt.video:
+        render._extra("imageio")
+
+
 def main(argv=None):
     """Run one demonstration, print what it measured, draw it.  Test: tests/test_drop_demos.py::test_command"""
     argv = list(sys.argv[1:] if argv is None else argv)
     names = [*DEMOS, "all"]
     name = argv.pop(0) if argv and not argv[0].startswith("-") else None
+    if name is None and (late := next((a for a in argv if a in names), None)):
+        rest = " ".join(a for a in argv if a != late)
+        raise UserError(f"the demonstration comes first: drop.py {late} {rest}")
     opt = cli(Options, argv, f"drop.py {name or 'DEMO'}", __doc__)
     if name not in names:
         raise UserError(
             f"drop.py needs a demonstration{'' if name is None else f', not {name!r}'}; valid: {', '.join(names)}"
         )
+    check_outputs(opt)
     stage, takes = Stage(opt), []
     print(f"{len(stage.clips)} clips, {sum(len(c[1]) for c in stage.clips) * STEP / 60:.1f} min; prior {opt.prior}")
     for each in DEMOS if name == "all" else [name]:
@@ -736,7 +849,7 @@ def main(argv=None):
         takes += DEMOS[each](stage, np.random.default_rng(opt.seed))
     for take in takes:
         print(report(take))
-    if opt.png or opt.video:
+    if takes and (opt.png or opt.video):
         write_pictures(takes, opt)
 
 

@@ -100,7 +100,15 @@ class NearestPrior:
         self.basis = vt[:components].T
         self.bank = ((f - self.mean) @ self.basis).astype(np.float32)
         self.norm = np.einsum("ij,ij->i", self.bank, self.bank)
-        self._last = self._mode = None
+
+    @property
+    def floor(self):
+        """Plane under the character, or None.  Test: tests/test_drop.py::test_nearest_prior_sees_a_new_floor"""
+        return self._floor
+
+    @floor.setter
+    def floor(self, plane):
+        self._floor, self._last, self._mode = plane, None, None  # what was found over another floor is void
 
     def features(self, x, v, quat):
         """(T, 72) features whose distances are RMS metres a joint.  x, v (T, 22, 3), quat (T, 22, 4)."""
