@@ -342,10 +342,10 @@ def failures(opt):
         states, found = [s[0] for s in take.states], [o[0] for o in take.outcomes]
         by = detect(states, found)
         quat = np.array([s.quat[0] for s in states])
-        rate = np.degrees(quat_angle(quat[1:], quat[:-1]) / STEP)
+        rate = np.degrees(quat_angle(quat[1:], quat[:-1]) / STEP)[len(states) // 4 :]
         take.notes["found superhuman"] = (
             ", ".join(f"{k} {100 * v.mean():.0f} %" for k, v in by.items())
-            + f" of frames (limit {detect.limit:.0f} N m); pelvis turns at up to {np.percentile(rate[len(rate) // 4 :], 95):.0f} "
+            + f" of frames (limit {detect.limit:.0f} N m); pelvis turns at up to {np.percentile(rate, 95):.0f} "
             f"degrees/s, median root wrench {np.median([o.wrench for o in found]):.0f}"
         )
         takes.append(take)

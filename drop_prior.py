@@ -18,7 +18,6 @@ import functools
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import drop_vae as vae
 from drop import OFFSETS, PARENTS, PATH, STEP, J, N, align, forward_kinematics, swing_twist
@@ -222,11 +221,11 @@ class VaePrior:
         out, C = net.decode(np.repeat(s, len(z), axis=0), z, x[0, 0, 2], columns)
         cos, sin = frame[0][0], frame[1][0]
         spin = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-        # float64 again, and bones exact: positions by kinematics of the rotations found
+        # float64 again: positions by kinematics of the rotations found (orthonormal to 1e-7)
         R = np.matmul(spin, np.swapaxes(C, -1, -2).astype(float))
         bones = np.matmul(R[:, PARENTS[1:]], OFFSETS[1:, :, None])[..., 0]
         root = out[:, 0].astype(float) @ spin.T + state.x[0] * [1, 1, 0] + lift
-        quat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(scalar_first=True).reshape(-1, N, 4)
+        quat = vae.quat_of(R)
         found = root[:, None] + PATH @ bones
         self._mode = state, found[0], quat[0]
         return (found[1:], quat[1:]) if rng is not None else (found, quat)

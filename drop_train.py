@@ -449,9 +449,8 @@ def detection(net, bound, recording, rng, n=500):
             below = vae._ANCESTORS[:, joint] > 0
             parent = C0[:, drop.PARENTS[joint]]
             rest = np.matmul(C0[:, below], np.swapaxes(C0[:, [joint]], -1, -2))  # descendants relative to the joint
-            bent = np.matmul(
-                vae.rotate_rows(np.eye(3), np.broadcast_to(degrees * axis, (3, 3))), parent
-            )  # from straight
+            straight = vae.rotate_rows(np.eye(3), degrees * axis)  # the joint's turn as rows, Lᵀ of R = R_parent L
+            bent = np.matmul(straight, parent)
             C[:, below] = np.matmul(rest, bent[:, None])
         x = vae.kinematics_forward(np.zeros((n, 3)), C)
         quat = (

@@ -68,6 +68,9 @@ def test_gram_schmidt():
     found = vae.gram_schmidt_forward(vae.columns_of(R.as_quat(scalar_first=True)))[0]
     np.testing.assert_allclose(np.swapaxes(found, 1, 2), R.as_matrix(), atol=1e-12)
     assert np.isfinite(vae.gram_schmidt_forward(np.zeros((1, 2, 3)))[0]).all()
+    some = Rotation.concatenate([R, Rotation.from_rotvec(np.pi * np.eye(3)), Rotation.identity()])
+    q, there = vae.quat_of(some.as_matrix()), some.as_quat(scalar_first=True)
+    np.testing.assert_allclose(np.abs(np.sum(q * there, axis=1)), 1.0, atol=1e-12)
 
 
 def test_kinematics():
@@ -261,13 +264,13 @@ def test_transition():
     np.testing.assert_allclose(up - flat, np.broadcast_to([0, 0, 0.08], up.shape), atol=1e-5)
 
 
-TINY = dict(updates=48, batch=16, rollout=4, latent=4, hidden=16, pose_latent=4, pose_hidden=16)
+TINY = dict(updates=24, batch=16, rollout=4, latent=4, hidden=16, pose_latent=4, pose_hidden=16)
 
 
 def test_training_learns():
     """A tenth of a minute halves both reconstructions and moves information through z; schedules go where they say."""
     t = training.Trainer(
-        training.Options(**TINY | {"updates": 320, "batch": 64, "hidden": 48, "lr": 3e-3}), recording()
+        training.Options(**TINY | {"updates": 240, "batch": 64, "hidden": 48, "lr": 3e-3}), recording()
     )
     first = t.schedule()
     begin = t.iterate()
@@ -288,7 +291,7 @@ def test_training_resumes(tmp_path, monkeypatch):
     iterate = training.Trainer.iterate
 
     def stop(self):
-        if self.updates == 24:
+        if self.updates == 12:
             raise KeyboardInterrupt
         return iterate(self)
 
@@ -297,11 +300,11 @@ def test_training_resumes(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         training.train(opt)
     monkeypatch.setattr(training.Trainer, "iterate", iterate)
-    assert load_checkpoint(tmp_path / "b" / CHECKPOINT)[1]["updates"] == 24
+    assert load_checkpoint(tmp_path / "b" / CHECKPOINT)[1]["updates"] == 12
     again = training.train(training.replace(opt, resume=True))
     for name, net in whole.nets.items():
         np.testing.assert_array_equal(net.theta, again.nets[name].theta)
-    assert len(read_metrics(tmp_path / "b" / "metrics.csv")["kl"]) == 4
+    assert len(read_metrics(tmp_path / "b" / "metrics.csv")["kl"]) == 2
     with pytest.raises(UserError, match="--resume"):
         training.train(opt)
     save_checkpoint(tmp_path / "b" / CHECKPOINT, {"x": np.zeros(2)}, {"updates": 1})
@@ -345,7 +348,7 @@ def test_shipped():
     """Small, licensed, no posterior collapse; better than going on as before on the built-in walk."""
     motion_net, pose, meta = shipped()
     assert drop_prior.WEIGHTS.stat().st_size < 4e6
-    assert "bandai" in meta["licence"] and "NC" in meta["licence"] and meta["options"]["motion"] == "bandai"
+    assert "bandai" in meta["licence"] and "NonCommercial" in meta["licence"] and meta["options"]["motion"] == "bandai"
     assert meta["bound"] > 1 and meta["updates"] >= 1000
     r = training.Recording([motion("walk", 6.0, 3)])
     linear = training.LinearAR(motion_net, r, n=300)
@@ -386,8 +389,8 @@ def test_vae_prior():
     x, quat = prior.sample(state, 16, RNG(0))
     mode, turned = prior.mode(state)
     assert x.shape == (16, N, 3) and quat.shape == (16, N, 4) and mode.shape == (N, 3)
-    np.testing.assert_allclose(np.linalg.norm(drop.DIFFERENCE @ x, axis=-1), np.tile(LENGTHS, (16, 1)), rtol=1e-9)
-    np.testing.assert_allclose(drop.forward_kinematics(x[:, 0], quat), x, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(drop.DIFFERENCE @ x, axis=-1), np.tile(LENGTHS, (16, 1)), rtol=2e-6)
+    np.testing.assert_allclose(drop.forward_kinematics(x[:, 0], quat), x, atol=2e-6)
     assert 1e-4 < x.std(axis=0).mean() < 0.05 and np.abs(x - state.x).max() < 0.3
     fresh = VaePrior(shipped()[0])
     np.testing.assert_allclose(fresh.mode(state)[0], mode, atol=1e-6)
