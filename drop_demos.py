@@ -1,6 +1,6 @@
 r"""DROP's demonstrations  [DROP §8]: pushes, projectiles, collisions, constraints, platforms; measured and drawn.
 
-    python drop.py DEMO [--prior nearest] [--motion builtin] [--seed 0] [--png OUT.png] [--video OUT.mp4]
+    python drop.py DEMO [--prior nearest|vae] [--motion builtin] [--seed 0] [--png OUT.png] [--video OUT.mp4]
 
 push         torso, hand and foot, small and large (§8.1)          constrain    a hand held by a force, by an energy
 projectiles  balls thrown at a walker, who then dodges them        trip         the heel held for 1 s
@@ -8,7 +8,7 @@ collide      two characters, each an obstacle to the other         tilt         
 follow       a direction that turns every 4 s, 1.2 and 2.5 m/s,    stiff-knee   a strong spring from hip to heel
              and led by the hand                                   ragdoll      no prior
 backflip     a clip until the push, then the prior                 wrench       the root wrench of motions (Fig. 7)
-weights      a table: weights against 1/h²
+weights      a table: weights against 1/h²                          energies, ablations, failures: drop_figures.py
 all          every one of them
 
 Red: forces from outside.  Blue: the contact forces of Eq. 11.  `fell` is a pelvis below 0.6 of its standing height, or
@@ -31,7 +31,7 @@ import gait
 import mocap
 import render
 from drop import GRAVITY, LENGTHS, RADII, STANDING, STEP, J, N, Plane, Simulator, Spheres
-from drop_prior import ClipPrior, NearestPrior, SwitchPrior
+from drop_prior import WEIGHTS, ClipPrior, NearestPrior, PoseRange, SwitchPrior, VaePrior, load_networks
 from human import Clip, heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate
 from runs import NONNEGATIVE, UserError, arg, cli, run_main
 
@@ -40,8 +40,8 @@ from runs import NONNEGATIVE, UserError, arg, cli, run_main
 class Options:
     """What to show."""
 
-    prior: str = arg("nearest", "nearest transitions, the clip's next frame, or none (a rag doll)",
-                     choices=("nearest", "clip", "none"))  # fmt: skip
+    prior: str = arg("nearest", "nearest transitions, the learned prior, the clip's next frame, or none (a rag doll)",
+                     choices=("nearest", "vae", "clip", "none"))  # fmt: skip
     motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names, for files and folders")
     seed: int = arg(0, "seed of the prior's samples", check=NONNEGATIVE)
@@ -50,6 +50,8 @@ class Options:
     correction: bool = arg(True, "the soft correction of the root wrench (Eq. 14)")
     contact: bool = arg(True, "the contact energy (Eq. 6)")
     limits: bool = arg(True, "the range-of-motion energy (Eq. 7)")
+    range: str = arg("limits", "range of motion: joint limits, or the pose VAE (Eq. 15)", choices=("limits", "vae"))
+    weights: str = arg(str(WEIGHTS), "of the learned priors, for `vae`")
 
 
 # ------------------------------------------------------------------------------------ motions
@@ -172,7 +174,14 @@ class Stage:
 
     def __init__(self, opt):
         self.opt, self.clips = opt, motions(opt)
-        self.nearest = NearestPrior([c[1:] for c in self.clips]) if opt.prior == "nearest" else None
+        self.general, self.limits = None, drop.project_range_of_motion if opt.limits else None
+        if "vae" in (opt.prior, opt.range):
+            motion, pose, meta = load_networks(opt.weights)
+            self.limits = PoseRange(pose, meta["bound"]) if opt.limits and opt.range == "vae" else self.limits
+        if opt.prior == "vae":
+            self.general = VaePrior(motion)
+        elif opt.prior == "nearest":
+            self.general = NearestPrior([c[1:] for c in self.clips])
 
     def again(self):
         """A generator with the seed of the options: takes that are compared draw the same numbers."""
@@ -180,7 +189,7 @@ class Stage:
 
     def prior(self, x, quat, at):
         """The prior asked for; a clip's prior follows the clip the take starts from."""
-        return {"nearest": self.nearest, "clip": ClipPrior(x, quat, at), "none": None}[self.opt.prior]
+        return ClipPrior(x, quat, at) if self.opt.prior == "clip" else self.general
 
     def start(self, speed, at=60, prior=None, place=None, turn=0.0, **settings):
         """A simulator and its first state: frame `at` of the clip nearest to `speed`, moved to `place` (2,)."""
@@ -193,8 +202,8 @@ class Stage:
             quat = quat_mul(np.broadcast_to(spin, quat.shape), quat)
         o = self.opt
         sim = Simulator(prior or self.prior(x, quat, at), correction=o.correction, contact=o.contact,
-                        limits=drop.project_range_of_motion if o.limits else None, **settings)  # fmt: skip
-        if isinstance(sim.prior, NearestPrior):
+                        limits=self.limits, **settings)  # fmt: skip
+        if hasattr(sim.prior, "floor"):
             sim.prior.floor = None
         return sim, sim.begin(x[at], quat[at], (x[at] - x[at - 1]) / STEP)
 
@@ -498,7 +507,7 @@ def tilt(stage, rng):
             normal = np.array([0, 0, np.cos(angle)]) + np.sin(angle) * np.cross(axis, [0, 0, 1.0])
             plane = Plane(normal, float(normal @ pivot))
             sim.obstacles = (plane,)
-            if isinstance(sim.prior, NearestPrior):
+            if hasattr(sim.prior, "floor"):
                 sim.prior.floor = plane
             return None, {}, ()
 
@@ -556,7 +565,7 @@ def backflip(stage, rng):
     landing = int(np.flatnonzero(up < -0.5)[-1])
     first, at = max(landing - 45, 1), min(landing + 12, len(x) - 2)
     onset = at - first
-    after = stage.nearest or ClipPrior(x, quat, first)
+    after = stage.general or ClipPrior(x, quat, first)
     sim, _ = stage.start(0.0, prior=SwitchPrior(ClipPrior(x, quat, first), after, onset))
     state = sim.begin(x[first], quat[first], (x[first] - x[first - 1]) / STEP)
     act = _pushing("spine3", np.array([0.0, 60.0, 0.0]), (onset, onset + 8))
@@ -715,6 +724,7 @@ DEMOS = {
     "tilt": tilt, "stiff-knee": stiff_knee, "ragdoll": ragdoll, "wrench": wrench, "backflip": backflip,
     "weights": weights,
 }  # fmt: skip
+FIGURES = ("energies", "ablations", "failures")  # drop_figures.py
 
 
 # ------------------------------------------------------------------------------------ pictures
@@ -826,8 +836,12 @@ def check_outputs(opt):
 def main(argv=None):
     """Run one demonstration, print what it measured, draw it.  Test: tests/test_drop_demos.py::test_command"""
     argv = list(sys.argv[1:] if argv is None else argv)
-    names = [*DEMOS, "all"]
+    names = [*DEMOS, "all", *FIGURES]
     name = argv.pop(0) if argv and not argv[0].startswith("-") else None
+    if name in FIGURES:
+        import drop_figures
+
+        return drop_figures.main(name, argv)
     if name is None and (late := next((a for a in argv if a in names), None)):
         rest = " ".join(a for a in argv if a != late)
         raise UserError(f"the demonstration comes first: drop.py {late} {rest}")

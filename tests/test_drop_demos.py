@@ -340,8 +340,8 @@ def test_command(monkeypatch, capsys, tmp_path):
     assert code == 2 and "nearest" in out.err
     code, out = run("backflip")
     assert code == 2 and "turns upside down" in out.err
-    for prior in ("clip", "none"):
-        code, out = run("stiff-knee", "--prior", prior)
+    for prior in ("clip", "none", "vae"):
+        code, out = run("stiff-knee", "--prior", prior, "--range", "vae")
         assert code == 0 and "stiff knee" in out.out
     if render.gl_backend() is None:
         pytest.skip("no OpenGL: neither egl nor osmesa starts here")
