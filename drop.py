@@ -259,7 +259,8 @@ def direction(w, x, x_t, v_tar, h=STEP):
 MU, EDGES = 0.8, 4  # ASSUMED: Coulomb friction of a shoe, edges of the linearised cone (Eq. 11)
 WRENCH_MARGIN = 0.03  # m, ASSUMED: a sphere this near to an obstacle may carry a contact force
 # ASSUMED: the root wrench that is left alone.  Up to this much of a push is borne by nothing, so it must be small;
-# built-in walks have medians of 4 to 8 themselves, runs of 14 to 20, so that runs are corrected a little all the time.
+# built-in walks have medians of 4 to 8 themselves.  Runs have 14 to 20, and 42 to 58 in a twentieth of their frames:
+# drop_demos.Stage gives them that (`wrench_limit`).
 WRENCH_LIMIT = 15.0
 WRENCH_WEIGHT = 1e-6  # w_p of Eq. 14, ASSUMED: removes 95 % of a residual force, 60 to 80 % of a torque
 

