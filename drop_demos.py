@@ -405,7 +405,8 @@ def follow(stage, rng):
     ASSUMED   v_tar points at the dot; its size is the dot's speed times the distance over 0.6 s of way, at most 1.25
     Test      tests/test_drop_demos.py::test_follower_keeps_the_speed
     """
-    return [_follow(stage, stage.again(), speed, led) for speed, led in ((1.2, False), (2.5, False), (1.2, True), (2.5, True))]
+    takes = ((1.2, False), (2.5, False), (1.2, True), (2.5, True))
+    return [_follow(stage, stage.again(), speed, led) for speed, led in takes]
 
 
 LEAD_STIFFNESS, LEAD_LIMIT = 200.0, 40.0  # N/m, N, ASSUMED: the hand that leads
