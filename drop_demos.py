@@ -373,6 +373,8 @@ def follow(stage, rng):
 
 def _follow(stage, rng, speed, led, frames=480):
     sim, state = stage.start(speed)
+    if isinstance(sim.prior, VaePrior):
+        sim.prior = VaePrior(sim.prior.net, spread=0.3)
     yaw, ahead = heading(state.quat[0]), 0.6 * speed
     way = lambda t: yaw + (t * STEP // 4) * np.pi / 2  # noqa: E731
     dot = state.com[:2] + ahead * np.array([np.cos(yaw), np.sin(yaw)])
