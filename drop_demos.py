@@ -414,6 +414,8 @@ LEAD_STIFFNESS, LEAD_LIMIT = 200.0, 40.0  # N/m, N, ASSUMED: the hand that leads
 
 def _follow(stage, rng, speed, led, frames=480):
     sim, state = stage.start(speed)
+    if isinstance(sim.prior, VaePrior):
+        sim.prior = VaePrior(sim.prior.net, spread=0.3)
     yaw, ahead, reach = heading(state.quat[0]), 0.6 * speed, []
     way = lambda t: yaw + (t * STEP // 4) * np.pi / 2  # noqa: E731
     dot = state.com[:2] + ahead * np.array([np.cos(yaw), np.sin(yaw)])

@@ -41,6 +41,7 @@ class Options(demos.Options):
     count: int = arg(250, "energies: motions", check=POSITIVE)
     frames: int = arg(160, "energies: frames of each", check=POSITIVE)
     newton: float = arg(60.0, "the push, 0.5 s on the pelvis, horizontally anywhere [N on 22 kg]", check=POSITIVE)
+    samples: int = arg(16, "energies: samples of the prior a frame", check=POSITIVE)
     csv: str | None = arg(None, "energies: write the medians here")
 
 
@@ -102,7 +103,8 @@ def ensemble(stage, opt, contact=True, limits=True):
         prior = stage.prior(x, quat, at)
         if hasattr(prior, "floor"):
             prior.floor = None
-        sim = Watched(prior, contact=contact, limits=stage.limits if limits else None, correction=opt.correction)
+        sim = Watched(prior, contact=contact, limits=stage.limits if limits else None, correction=opt.correction,
+                      samples=opt.samples)  # fmt: skip
         sim.measure = stage.limits or drop.project_range_of_motion
         state = sim.begin(x[at], quat[at], (x[at] - x[at - 1]) / STEP)
         force = demos.one_force("pelvis", opt.newton * np.array([np.cos(angle), np.sin(angle), 0.0]))

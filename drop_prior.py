@@ -203,14 +203,16 @@ class VaePrior:
     Equation  z ~ N(μ0(s), σ0(s)²) for the set of samples, z = μ0(s) for the mode; x̃ by forward kinematics of the
               decoded rotations
     Args      net : drop_vae.MotionVAE; floor : Plane under the character or None; velocity : "own" (§7: what the prior
-              itself predicted) or "solved" (differences of the solved positions)
+              itself predicted) or "solved" (differences of the solved positions); spread : standard deviation of the
+              angle [rad] by which samples, not the mode, are turned about the pelvis, as NearestPrior's are
+    ASSUMED   spread 0, and 0.3 where a direction leads (drop_demos.follow): trained on few turns, z alone does not turn
     Test      tests/test_drop_vae.py::test_vae_prior
     """
 
-    def __init__(self, net, floor=None, velocity="own"):
+    def __init__(self, net, floor=None, velocity="own", spread=0.0):
         if velocity not in ("own", "solved"):
             raise ValueError(f"velocity {velocity!r}: valid are own, solved")
-        self.net, self.floor, self.velocity = net, floor, velocity
+        self.net, self.floor, self.velocity, self.spread = net, floor, velocity, spread
         self._mode = None
 
     def sample(self, state, n, rng):
@@ -227,12 +229,16 @@ class VaePrior:
         if rng is not None:
             z[1:] += np.exp(log_std) * rng.standard_normal((n, net.latent)).astype(np.float32)
         out, C = net.decode(np.repeat(s, len(z), axis=0), z, x[0, 0, 2], columns)
-        cos, sin = frame[0][0], frame[1][0]
-        spin = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+        angle = np.full(len(z), np.arctan2(frame[1][0], frame[0][0]), float)
+        if rng is not None and self.spread:
+            angle[1:] += rng.normal(0.0, self.spread, n)
+        spin = np.zeros((len(z), 3, 3))
+        spin[:, 0, 0] = spin[:, 1, 1] = np.cos(angle)
+        spin[:, 1, 0], spin[:, 0, 1], spin[:, 2, 2] = np.sin(angle), -np.sin(angle), 1.0
         # float64 again: positions by kinematics of the rotations found (orthonormal to 1e-7)
-        R = np.matmul(spin, np.swapaxes(C, -1, -2).astype(float))
+        R = np.matmul(spin[:, None], np.swapaxes(C, -1, -2).astype(float))
         bones = np.matmul(R[:, PARENTS[1:]], OFFSETS[1:, :, None])[..., 0]
-        root = out[:, 0].astype(float) @ spin.T + state.x[0] * [1, 1, 0] + lift
+        root = np.matmul(spin, out[:, 0, :, None].astype(float))[..., 0] + state.x[0] * [1, 1, 0] + lift
         quat = vae.quat_of(R)
         found = root[:, None] + PATH @ bones
         self._mode = state, found[0], quat[0]

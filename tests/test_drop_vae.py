@@ -404,6 +404,10 @@ def test_vae_prior():
     own = State(state.x, state.v, state.quat, 0, 0 * state.v)
     assert np.abs(prior.mode(own)[0] - mode).max() > 1e-3  # the prior's own velocities are what it sees
     np.testing.assert_allclose(VaePrior(shipped()[0], velocity="solved").mode(own)[0], mode, atol=1e-6)
+    wide = VaePrior(shipped()[0], spread=0.5)
+    faces = drop_prior.heading(wide.sample(state, 60, RNG(1))[1][:, 0]) - drop_prior.heading(turned[0])
+    assert 0.3 < np.std(np.angle(np.exp(1j * faces))) < 0.7
+    np.testing.assert_allclose(wide.mode(state)[0], mode, atol=1e-6)
     with pytest.raises(ValueError, match="own, solved"):
         VaePrior(shipped()[0], velocity="x")
 
