@@ -4,7 +4,7 @@ r"""How fast it is: every part of training beside the physics it cannot beat, in
     python bench.py --character jesse --json OUT     characters.NAME.{physics, environment, inference, update, ...}
     python bench.py --scaling                        1 and all threads, 64 to 4,096 environments
     python bench.py --physics                        what other steps, solvers and iterations would cost and spoil
-    python bench.py --drop --json OUT                DROP's simulator: drop.{fps, fps_pushed, samples, characters}
+    python bench.py --drop --json OUT                DROP's simulator: drop.{fps, fps_pushed, fps_vae, …}
 
 physics       bare `mujoco.rollout` of the same model and substeps, from the same states
 environment   `Env.step`: physics, refresh, reward, termination, reset, observation
@@ -194,14 +194,15 @@ def bench_drop(frames=60, rounds=7) -> dict:
     r"""DROP's frames a second on one core: default prior, soft correction, energies and contact forces computed.
 
     Method    CPU time of the process (run it with OMP_NUM_THREADS=1), median of rounds of 2 s of walking
-    Returns   fps; fps_pushed : the same, pushed sideways all the time, so that most steps are corrected;
+    Returns   fps; fps_pushed : the same, pushed sideways all the time, so that most steps are corrected; fps_vae : by
+              the learned prior, its 16 samples, and the pose VAE;
               samples : {n: fps}; characters : {k: frames a second of the scene}
     Test      tests/test_bench.py::test_bench_drop
     """
-    stage = drop_demos.Stage(drop_demos.Options())
+    nearest = drop_demos.Stage(drop_demos.Options())
     rng = np.random.default_rng(0)
 
-    def rate(characters=1, newton=0.0, **settings):
+    def rate(characters=1, newton=0.0, stage=nearest, **settings):
         sim, first = stage.start(1.2, **settings)
         force = np.zeros((drop.N, 3))
         force[drop.J["spine3"], 1] = newton
@@ -214,6 +215,7 @@ def bench_drop(frames=60, rounds=7) -> dict:
         return float(1.0 / np.median(times[1:]))
 
     out = {"fps": rate(), "fps_pushed": rate(newton=70.0)}
+    out["fps_vae"] = rate(stage=drop_demos.Stage(drop_demos.Options(prior="vae", range="vae")))
     out["samples"] = {n: rate(samples=n) for n in (1, 4, 64, 256)}
     out["characters"] = {k: rate(characters=k) for k in (2, 4, 8)}
     return out
@@ -236,7 +238,8 @@ def main(argv=None):
     results, more = {}, {}
     if opt.drop:
         more["drop"] = r = bench_drop(rounds=opt.rounds)
-        print(f"\nDROP, one character, one core: {r['fps']:.0f} frames/s; {r['fps_pushed']:.0f} while it is pushed")
+        print(f"\nDROP, one character, one core: {r['fps']:.0f} frames/s; {r['fps_pushed']:.0f} while it is pushed; "
+              f"{r['fps_vae']:.0f} with both VAEs")  # fmt: skip
         print("  samples     " + "   ".join(f"{n}: {v:.0f}" for n, v in r["samples"].items()))
         print("  characters  " + "   ".join(f"{k}: {v:.0f}" for k, v in r["characters"].items()))
     for name in names:

@@ -12,7 +12,8 @@ not to a person's 70: a push of F newtons here moves the body as one of 3.2 F wo
 
     python drop.py DEMO [--prior nearest] [--motion builtin] [--seed 0] [--png OUT | --video OUT]
 
-Motion priors are in drop_prior.py (§5), the demonstrations in drop_demos.py (§8).
+The character's body is in drop_body.py (§4, §7), motion priors in drop_prior.py (§5), demonstrations in drop_demos.py
+(§8).
 """
 
 from __future__ import annotations
@@ -24,128 +25,47 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
-from human import SEG, quat_conj, quat_matrix, quat_mul, quat_rotate, quat_slerp
+from drop_body import (  # noqa: F401, I001 (all of the character, for those who import it from here)
+    _EYE,
+    _EYE3,
+    _SKEW,
+    AXIS,
+    BASIS,
+    CHILD,
+    DIFFERENCE,
+    FEET,
+    GRAVITY,
+    HIGH,
+    JOINTS,
+    LEAF_DAMPING,
+    LEAVES,
+    LENGTHS,
+    LIMITED,
+    LIMITS,
+    LOW,
+    OFFSETS,
+    PARENTS,
+    PATH,
+    RADII,
+    STANDING,
+    STEP,
+    J,
+    N,
+    _checked,
+    _unit,
+    align,
+    character_motion,
+    forward_kinematics,
+    project_range_of_motion,
+    rest_offsets,
+    swing,
+    swing_twist,
+    twists,
+)  # fmt: skip
+from human import quat_conj, quat_rotate
 from runs import run_main
 
-# ------------------------------------------------------------------------------------ §4: the character
-
-JOINTS = (
-    "pelvis", "hip_l", "hip_r", "spine1", "knee_l", "knee_r", "spine2", "ankle_l", "ankle_r", "spine3", "foot_l",
-    "foot_r", "neck", "collar_l", "collar_r", "head", "shoulder_l", "shoulder_r", "elbow_l", "elbow_r", "wrist_l",
-    "wrist_r",
-)  # fmt: skip
-PARENTS = np.array([-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19])
-J = {name: i for i, name in enumerate(JOINTS)}
-N = len(JOINTS)
-STEP = 1.0 / 30.0  # h [s], §4
-GRAVITY = np.array([0.0, 0.0, -9.81])
-ITERATIONS = 3  # §5
-
-# Radii of the contact spheres [m].  ASSUMED ("manually-scaled spheres", §7): ankles and balls of the feet just touch
-# the floor in the standing pose of a 1.75 m person, the others fill limbs and trunk.
-RADII = np.array([
-    0.10, 0.08, 0.08, 0.09, 0.055, 0.055, 0.10, 0.068, 0.068, 0.10, 0.0245, 0.0245, 0.06, 0.06, 0.06, 0.11, 0.06,
-    0.06, 0.045, 0.045, 0.05, 0.05,
-])  # fmt: skip
-
-
-def rest_offsets(height=1.75):
-    r"""Each joint relative to its parent in the standing pose, arms hanging.
-
-    ASSUMED   SMPL's mean body is not to be had here: the canonical human's proportions (`gait.Body`).  Joints it lacks:
-              pelvis 0.035 H above the hips, spine1 halfway to the chest's base (spine2), spine3 0.07 H above it, neck
-              at 0.19 H, collars 0.04 H beside the middle at 0.18 H over it, foot = ball of the foot
-    Args      height : stature [m]
-    Returns   (22, 3) [m]
-    Test      tests/test_drop.py::test_character
-    """
-    import gait
-
-    b, x = gait.Body(height), np.zeros((N, 3))
-    place = lambda name, at: x.__setitem__(J[name], at)  # noqa: E731
-    hips = np.array([0.0, 0.0, b.ankle_height + b.shin + b.thigh])
-    chest = hips + b.chest
-    place("pelvis", hips + [0, 0, 0.035 * height])
-    place("spine1", 0.5 * (x[0] + chest))
-    place("spine2", chest)
-    place("spine3", chest + [0, 0, 0.07 * height])
-    place("neck", chest + [0, 0, 0.19 * height])
-    place("head", chest + b.head)
-    for side, sign in (("l", 1), ("r", -1)):
-        mirror = np.array([1.0, sign, 1.0])
-        hip, shoulder = hips + [0, sign * b.hip_half_width, 0], chest + b.shoulder * mirror
-        place(f"hip_{side}", hip)
-        place(f"knee_{side}", hip - [0, 0, b.thigh])
-        place(f"ankle_{side}", hip - [0, 0, b.thigh + b.shin])
-        place(f"foot_{side}", x[J[f"ankle_{side}"]] + b.ball)
-        place(f"collar_{side}", chest + np.array([0.0, 0.04, 0.18]) * height * mirror)
-        place(f"shoulder_{side}", shoulder)
-        place(f"elbow_{side}", shoulder - [0, 0, b.upper_arm])
-        place(f"wrist_{side}", shoulder - [0, 0, b.upper_arm + b.forearm])
-    out = x - x[PARENTS]
-    out[0] = x[0]
-    return out
-
-
-OFFSETS = rest_offsets()
-LENGTHS = np.linalg.norm(OFFSETS[1:], axis=-1)  # (21,) of the bone from joint j + 1 to its parent
-STANDING = OFFSETS[0, 2]  # height of the standing pelvis [m]
-# PATH @ bones = joints relative to the pelvis: PATH[j, i] is 1 where bone i lies between the pelvis and joint j.
-PATH = np.zeros((N, N - 1))
-for _j in range(1, N):
-    PATH[_j] = PATH[PARENTS[_j]]
-    PATH[_j, _j - 1] = 1.0
-_CROSS_OFFSETS = np.cross(np.eye(3), OFFSETS[1:, None]).swapaxes(1, 2)  # (21, 3, 3): u -> u × o
-DIFFERENCE = np.eye(N)[1:] - np.eye(N)[PARENTS[1:]]  # A of Eq. 5: (21, 22), bone = child − parent
-
-
-def forward_kinematics(root, quat):
-    r"""Joint positions from global rotations.
-
-    Equation  x_j = x_parent + R_parent o_j, with global R; hence x = root + PATH · (R_parent o)
-    Args      root : (..., 3) pelvis [m]; quat : (..., 22, 4) global rotations
-    Returns   (..., 22, 3) [m]
-    Test      tests/test_drop.py::test_forward_kinematics
-    """
-    q, o = quat[..., PARENTS[1:], :], OFFSETS[1:]
-    w, u = q[..., :1], q[..., 1:]
-    along = np.einsum("...ji,ji->...j", u, o)[..., None]
-    across = np.matmul(_CROSS_OFFSETS, u[..., None])[..., 0]  # u × o
-    bones = (2.0 * w * w - 1.0) * o + 2.0 * along * u + 2.0 * w * across
-    return np.asarray(root)[..., None, :] + PATH @ bones
-
-
-FEET = [J[n] for n in ("ankle_l", "foot_l", "ankle_r", "foot_r")]
-
-# Canonical segment (and, for the joints between two, the other) whose rotation each joint takes.
-_SEGMENT = dict(pelvis="pelvis", spine1="pelvis chest", spine2="chest", spine3="chest", neck="chest head", head="head")
-_SEGMENT |= {f"{a}_{s}": f"{b}_{s}" for s in "lr" for a, b in (
-    ("hip", "thigh"), ("knee", "shin"), ("ankle", "foot"), ("foot", "foot"), ("shoulder", "upper_arm"),
-    ("elbow", "forearm"), ("wrist", "hand"))}  # fmt: skip
-_SEGMENT |= {f"collar_{s}": "chest" for s in "lr"}
-
-
-def character_motion(clip):
-    r"""A canonical Clip as this character's motion.
-
-    Method    global rotations are copied (halfway between two segments where SMPL has a joint more), positions follow
-              by forward kinematics on the character's own bones; the root's path is scaled by the ratio of leg lengths,
-              and the clip is shifted until the lower foot touches the floor in a quarter of all frames
-    Args      clip : human.Clip
-    Returns   x (T, 22, 3) [m], quat (T, 22, 4), world frame
-    Test      tests/test_drop.py::test_character_motion
-    """
-    quat = np.empty((len(clip), N, 4))
-    for j, name in enumerate(JOINTS):
-        parts = [clip.quat[:, SEG[s]] for s in _SEGMENT[name].split()]
-        quat[:, j] = parts[0] if len(parts) == 1 else quat_slerp(*parts, np.full(len(clip), 0.5))
-    legs = [clip.limb(f"thigh_{s}", f"shin_{s}") + clip.limb(f"shin_{s}", f"foot_{s}") for s in "lr"]
-    scale = (LENGTHS[J["knee_l"] - 1] + LENGTHS[J["ankle_l"] - 1]) / np.mean(legs)
-    above_hips = np.array([0.0, 0.0, -OFFSETS[J["hip_l"], 2]])  # Clip's pelvis is the hips' midpoint
-    x = forward_kinematics(scale * clip.pos[:, 0] + quat_rotate(clip.quat[:, 0], above_hips), quat)
-    x[..., 2] -= np.percentile((x[..., 2] - RADII)[:, FEET].min(axis=1), 25)
-    return x, quat
-
+ITERATIONS = 3  # of local and global steps, §5
 
 # ------------------------------------------------------------------------------------ §4.1: the energies
 #
@@ -204,10 +124,20 @@ def project_rigidity(x, A=DIFFERENCE, lengths=LENGTHS):
 
 @dataclass(frozen=True)
 class Plane:
-    """The half space normal · x ≥ offset is free.  Test: tests/test_drop.py::test_obstacles"""
+    """The half space normal · x ≥ offset is free; both are divided by the normal's length.
+
+    Test: tests/test_drop.py::test_obstacles, ::test_bad_obstacles"""
 
     normal: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     offset: float = 0.0
+
+    def __post_init__(self):
+        normal = _checked(self.normal, (3,), "Plane: normal")
+        length = np.sqrt(normal @ normal)
+        if not (length > 1e-9 and np.isfinite(self.offset)):
+            raise ValueError(f"Plane: normal {self.normal} and offset {self.offset} are no half space")
+        object.__setattr__(self, "normal", normal / length)
+        object.__setattr__(self, "offset", float(self.offset) / length)
 
     def distance(self, x):
         """Signed distance (K,) and outward normal (K, 3) of points (K, 3)."""
@@ -234,11 +164,14 @@ class Spheres:
 
 @dataclass(frozen=True)
 class Box:
-    """A solid box.  Test: tests/test_drop.py::test_obstacles"""
+    """A solid box.  Test: tests/test_drop.py::test_obstacles, ::test_standing_on_a_box"""
 
     centre: np.ndarray  # (3,)
     half: np.ndarray  # (3,) half sizes
     quat: np.ndarray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+
+    def __post_init__(self):
+        object.__setattr__(self, "quat", _unit(_checked(self.quat, (4,), "Box: quat")[None], "Box: quat")[0])
 
     def distance(self, x):
         """Signed distance (K,) and outward normal (K, 3) of points (K, 3)."""
@@ -256,7 +189,8 @@ class Box:
 # ASSUMED: "about to penetrate" (§4.1) is a gap below 0, or below 5 mm for a particle that is in contact already.  A
 # particle found deep inside is pushed out by at most 3 cm a step (0.9 m/s), because its velocity of Eq. 2 would throw
 # it into the air.  Static friction holds up to 1 m/s: a contact that slides faster is slowed by that much a step, or a
-# swinging foot that grazes the floor by a millimetre would be nailed to it.
+# swinging foot that grazes the floor by a millimetre would be nailed to it.  (`Simulator.begin` lifts a body out of the
+# floor at once; a State made without it, 0.7 m under, takes 0.8 s to come up.)
 CONTACT_MARGIN, PUSH_OUT, SLIP = 0.005, 0.03, 1.0
 
 
@@ -266,6 +200,8 @@ def gaps(x, obstacles, radii=RADII):
     Returns   gap (22,) [m], negative in penetration; normal (22, 3)
     Test      tests/test_drop.py::test_obstacles
     """
+    if not obstacles:
+        raise ValueError("no obstacles; one Plane is the least, however far below")
     gap, normal = obstacles[0].distance(x)
     for other in obstacles[1:]:
         g, n = other.distance(x)
@@ -318,190 +254,14 @@ def direction(w, x, x_t, v_tar, h=STEP):
     return 0.5 * w * float(r @ r), np.broadcast_to(w / h * r, x.shape).copy()
 
 
-# ------------------------------------------------------------------------------------ §7: rotations, range of motion
-
-# Joints with one child: its bone gives the swing, the prior the twist.  Pelvis and spine3 have three children, whose
-# bones give the whole rotation.  Levels: a joint stands after its parent, and those of a level are solved at once.
-CHILD = {j: int(np.flatnonzero(PARENTS == j)[0]) for j in range(N) if np.sum(PARENTS == j) == 1}
-LEAVES = np.array([j for j in range(N) if not np.any(PARENTS == j)])
-_CHILDREN = np.array([CHILD.get(j, 0) for j in range(N)])
-_LEVELS = [
-    (g, PARENTS[g], _CHILDREN[g] - 1) for g in map(np.array, ([1, 2, 3, 12, 13, 14], [4, 5, 6, 16, 17], [7, 8, 18, 19]))
-]
-_FORKS, _ROWS = [0, 9], np.array([[1, 2, 3], [12, 13, 14]])
-_FORK_OFFSETS, _FORK_BONES, _FORK_LENGTHS = OFFSETS[_ROWS], _ROWS - 1, LENGTHS[_ROWS - 1, None]
-LIMITED = np.array([1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 13, 14, 16, 17, 18, 19])  # non-leaf joints but the root
-AXIS = np.zeros((N, 3))  # the bone at rest: the twist's axis
-for _j in LIMITED:
-    _o = OFFSETS[CHILD.get(_j, J["neck"])]
-    AXIS[_j] = _o / np.linalg.norm(_o)
-LEAF_DAMPING = 0.1  # ASSUMED: share of the leaves' rotation that the spring towards rest takes away each step (§7)
-
-
-def _basis():
-    """Two unit vectors across each bone: the first as near to the y axis (flexion) as can be."""
-    basis = np.zeros((N, 2, 3))
-    for j in LIMITED:
-        side = np.array([1.0, 0, 0]) if abs(AXIS[j, 1]) > 0.9 else np.array([0, 1.0, 0])
-        e = side - (side @ AXIS[j]) * AXIS[j]
-        basis[j, 0] = e / np.linalg.norm(e)
-        basis[j, 1] = np.cross(AXIS[j], basis[j, 0])
-    return basis
-
-
-BASIS = _basis()
-# Limits [degrees] of swing about the flexion axis (for legs, spine and neck: +y, which flexes the knee and extends the
-# hip), of swing about the other axis (thigh and upper arm: about +x, outwards on the left side) and of twist.
-# ASSUMED: wide textbook ranges, opened until recorded walking and running stays inside.
-LIMITS = {
-    "hip": ((-125, 40), (-35, 55), (-60, 60)), "knee": ((-8, 155), (-20, 20), (-45, 45)),
-    "ankle": ((-45, 65), (-40, 40), (-40, 40)), "spine1": ((-35, 50), (-35, 35), (-35, 35)),
-    "spine2": ((-35, 50), (-35, 35), (-35, 35)), "spine3": ((-25, 35), (-25, 25), (-25, 25)),
-    "neck": ((-50, 50), (-40, 40), (-60, 60)), "collar": ((-30, 30), (-30, 30), (-30, 30)),
-    "shoulder": ((-170, 75), (-70, 165), (-110, 110)), "elbow": ((-155, 10), (-35, 35), (-120, 120)),
-}  # fmt: skip
-
-
-def _limits():
-    low, high = np.zeros((N, 3)), np.zeros((N, 3))
-    for j in LIMITED:
-        name, _, side = JOINTS[j].partition("_")
-        low[j], high[j] = np.radians(LIMITS[name]).T
-        if side == "r":  # the mirror image: angles about x and about the bone change their signs
-            low[j, 1:], high[j, 1:] = -high[j, 1:].copy(), -low[j, 1:].copy()
-    return low, high
-
-
-LOW, HIGH = _limits()
-_EYE, _EYE3 = np.eye(N), np.eye(3)
-_SKEW = np.zeros((3, 9))  # v @ _SKEW is the matrix [v]×, row by row
-_SKEW[0, [5, 7]], _SKEW[1, [2, 6]], _SKEW[2, [1, 3]] = (-1, 1), (1, -1), (-1, 1)
-
-
-def _turn(vectors):
-    """Rotation vectors (K, 3) -> matrices (K, 3, 3), by Rodrigues' formula."""
-    angle = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
-    K = (vectors @ _SKEW).reshape(-1, 3, 3)
-    safe = np.maximum(angle, 1e-12)
-    s, c = np.sin(angle) / safe, 2.0 * (np.sin(0.5 * angle) / safe) ** 2
-    return _EYE3 + s[:, None, None] * K + c[:, None, None] * (K @ K)
-
-
-def swing(axis, towards):
-    r"""Rotation vectors of the smallest turns from `axis` to `towards`.
-
-    Equation  θ n, with n = (a × u) / ‖a × u‖, θ = atan2(‖a × u‖, a · u); opposite vectors turn about any axis across a
-    Args      axis, towards : (K, 3) unit vectors
-    Returns   (K, 3) [rad], across `axis`
-    Test      tests/test_drop.py::test_swing_twist
-    """
-    n = np.matmul((axis @ _SKEW).reshape(-1, 3, 3), towards[:, :, None])[:, :, 0]
-    sine, cosine = np.sqrt(np.einsum("ij,ij->i", n, n)), np.einsum("ij,ij->i", axis, towards)
-    angle = np.arctan2(sine, cosine)
-    out = n * (angle / np.maximum(sine, 1e-12))[:, None]
-    if (back := (sine < 1e-9) & (cosine < 0)).any():
-        across = np.cross(axis[back], np.eye(3)[np.abs(axis[back]).argmin(axis=1)])
-        out[back] = np.pi * across / np.linalg.norm(across, axis=1, keepdims=True)
-    return out
-
-
-def align(offsets, bones):
-    r"""The rotations that turn `offsets` best into `bones` (Kabsch): argmin over R of Σ_i ‖R o_i − b_i‖².
-
-    Args      offsets, bones : (K, m, 3)
-    Returns   (K, 3, 3)
-    Test      tests/test_drop.py::test_swing_twist
-    """
-    u, _, vt = np.linalg.svd(np.swapaxes(bones, -1, -2) @ offsets)
-    u[..., :, 2] *= np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)[:, None]
-    return u @ vt
-
-
-def twists(quat):
-    r"""What positions cannot say: twist about each bone, and the leaves' local rotations.
-
-    Equation  local q = q_parent⁻¹ q = swing · twist, twist angle = 2 atan2(q_vec · axis, q_w)
-    Args      quat : (22, 4) global rotations of the prior's chosen sample
-    Returns   angle (22,) [rad], 0 for pelvis and leaves; leaves (5, 3, 3) damped towards rest (LEAF_DAMPING)
-    Test      tests/test_drop.py::test_swing_twist
-    """
-    local = quat_mul(quat_conj(quat[PARENTS]), quat)
-    angle = 2.0 * np.arctan2(np.einsum("ij,ij->i", local[:, 1:], AXIS), local[:, 0])
-    leaf = local[LEAVES] * np.where(local[LEAVES, :1] < 0, -1.0, 1.0)
-    leaf = (1.0 - LEAF_DAMPING) * leaf + LEAF_DAMPING * np.array([1.0, 0, 0, 0])
-    leaf /= np.linalg.norm(leaf, axis=1, keepdims=True)
-    return (angle + np.pi) % (2 * np.pi) - np.pi, quat_matrix(leaf)
-
-
-def swing_twist(x, twist):
-    r"""Joint rotations from positions.
-
-    Equation  [DROP §7] R_j = R_parent · swing(rest bone → solved bone, in the parent's frame) · twist of the prior's
-              sample; pelvis and spine3, with three children, by `align`; leaves: the sample's
-    Args      x : (22, 3); twist : what `twists` returns
-    Returns   R (22, 3, 3) global; u (22, 3) each limited joint's bone in its parent's frame, unit length
-    Test      tests/test_drop.py::test_swing_twist
-    """
-    angle, leaves = twist
-    bones = DIFFERENCE @ x
-    bones /= np.maximum(np.sqrt(np.einsum("ij,ij->i", bones, bones)), 1e-9)[:, None]
-    R, u = np.empty((N, 3, 3)), AXIS.copy()
-    R[_FORKS] = align(_FORK_OFFSETS, bones[_FORK_BONES] * _FORK_LENGTHS)
-    turn = _turn(angle[:, None] * AXIS)
-    for level, parents, bone in _LEVELS:
-        parent = R[parents]
-        u[level] = towards = np.matmul(bones[bone, None], parent)[:, 0]  # Rᵀ b: in the parent's frame
-        R[level] = parent @ _swing_matrix(AXIS[level], towards) @ turn[level]
-    R[LEAVES] = R[PARENTS[LEAVES]] @ leaves
-    u[9] = R[6].T @ R[9] @ AXIS[9]
-    return R, u
-
-
-def _swing_matrix(axis, towards):
-    """The turn of `swing` as matrices: I + [n]× + [n]×²/(1 + a · u), n = a × u (Rodrigues' formula without angles)."""
-    n = np.matmul((axis @ _SKEW).reshape(-1, 3, 3), towards[:, :, None])[:, :, 0]
-    cosine = np.einsum("ij,ij->i", axis, towards)
-    if cosine.min() < -1.0 + 1e-9:
-        return _turn(swing(axis, towards))
-    K = (n @ _SKEW).reshape(-1, 3, 3)
-    return _EYE3 + K + K @ K / (1.0 + cosine)[:, None, None]
-
-
-def project_range_of_motion(x, twist, solved=None):
-    r"""The pose moved back inside the joints' limits.
-
-    Equation  [DROP Eq. 7] x_r; here each joint's swing and twist is clipped to LIMITS, then forward kinematics, laid
-              on x as a rigid body (`align`): the nearest place, and the one whose pull has no net force or torque
-    Departs   §7 projects with a pose VAE (Eq. 15, VPoser), which is not to be had here; `limits` of `Simulator` takes
-              any other projection of this form
-    Args      x : (22, 3); twist : what `twists` returns; solved : swing_twist(x, twist), if it is known already
-    Returns   (22, 3): x itself if the pose is inside
-    Test      tests/test_drop.py::test_projections_are_nearest_and_idempotent, ::test_range_of_motion
-    """
-    R, u = solved or swing_twist(x, twist)
-    local = np.empty((N, 3))
-    vectors = swing(AXIS, u)
-    local[:, :2] = np.matmul(BASIS, vectors[:, :, None])[:, :, 0]
-    local[:, 2] = twist[0]
-    spine = _swing_matrix(AXIS[9:10], u[9:10])[0].T @ R[6].T @ R[9]  # what is left is a turn about the axis
-    local[9, 2] = np.arctan2(0.5 * np.sum((AXIS[9] @ _SKEW).reshape(3, 3) * spine), 0.5 * (np.trace(spine) - 1.0))
-    clipped = np.minimum(np.maximum(local, LOW), HIGH)
-    if np.abs(clipped - local)[LIMITED].max() < 1e-9:
-        return x
-    R = R.copy()
-    turn = _turn(np.matmul(clipped[:, None, :2], BASIS)[:, 0]) @ _turn(clipped[:, 2, None] * AXIS)
-    for j in LIMITED:  # parents come before children
-        R[j] = R[PARENTS[j]] @ turn[j]
-    out = PATH @ np.matmul(R[PARENTS[1:]], OFFSETS[1:, :, None])[:, :, 0]
-    out, centred = out - out.mean(axis=0), x - x.mean(axis=0)
-    return out @ align(out[None], centred[None])[0].T + x.mean(axis=0)
-
-
 # ------------------------------------------------------------------------------------ §6: root wrench
 
 MU, EDGES = 0.8, 4  # ASSUMED: Coulomb friction of a shoe, edges of the linearised cone (Eq. 11)
 WRENCH_MARGIN = 0.03  # m, ASSUMED: a sphere this near to an obstacle may carry a contact force
-WRENCH_LIMIT = 40.0  # ASSUMED: a residual below is left alone; 95 % of built-in running is below 42 to 58, walking 11
+# ASSUMED: the root wrench that is left alone.  Up to this much of a push is borne by nothing, so it must be small;
+# built-in walks have medians of 4 to 8 themselves.  Runs have 14 to 20, and 42 to 58 in a twentieth of their frames:
+# drop_demos.Stage gives them that (`wrench_limit`).
+WRENCH_LIMIT = 15.0
 WRENCH_WEIGHT = 1e-6  # w_p of Eq. 14, ASSUMED: removes 95 % of a residual force, 60 to 80 % of a torque
 
 
@@ -627,7 +387,7 @@ class State:
 
 @dataclass(frozen=True)
 class Weights:
-    r"""Weights of the energies, in units of M/h² = 900 N/m.
+    r"""Weights of the energies, in units of M/h² = 900 N/m; of `direction`, whose residual is a momentum, in 1/kg.
 
     ASSUMED   §7 gives 1, 3, 3, 3 without a scale.  REPRODUCE.md has the table these were chosen from
     """
@@ -647,8 +407,8 @@ class Outcome:
     energies: dict
     active: np.ndarray  # (22,) bool, contacts
     sample: int  # chosen, 0 is the mode; -1 without a prior
-    wrench_pd: float  # ‖b − F c‖ before the correction [N, N m]
-    wrench: float  # and after
+    wrench_pd: float  # ‖b − F c‖ of the solver's x, before correction and restored bones [N, N m]
+    wrench: float  # of the motion itself, with the same c
     points: np.ndarray  # (P, 3) where contact forces act
     forces: np.ndarray  # (P, 3) [N] of Eq. 11: slack variables, not simulated
     bone_error: float  # largest relative error of a bone before lengths were restored
@@ -664,18 +424,35 @@ class Simulator:
               contact, limits, correction : §8.3's switches; limits may be another projection (x, twist) -> x_r
               restore : bone lengths made exact at the end of a step
               springs : ((joint, joint, length [m], weight), …), such as a stiff knee's
-    ASSUMED   `restore`; only the part of the root wrench above WRENCH_LIMIT is corrected (§8.5: down to mocap's range);
-              inside the limits E_3, whose p is x, takes part in the matrix only where the prior alone drives: in three
-              iterations its drag holds a walker at the prior's mode, but freezes a rag doll or a led body
-    Test      tests/test_drop.py::test_step_solves_equation_4, ::test_never_nan, ::test_switches
+              wrench_limit : the root wrench below which nothing is corrected [N, N m]
+              inside : does E_3 take part while the pose is inside its limits, where p = x: "always", "never", or
+              "free", only where the prior alone drives (neither v_tar nor pins, and there are samples)
+    ASSUMED   `restore`; only the part of the root wrench above `wrench_limit` is corrected (§8.5: down to mocap's
+              range); `inside`: with p = x that energy drags towards the last iterate, in the first iteration towards
+              the prior's mode.  That holds a walker's feet, but freezes a rag doll or a led body
+    Raises    ValueError: a setting out of its range
+    Test      tests/test_drop.py::test_step_solves_equation_4, ::test_never_nan, ::test_switches, ::test_bad_settings
     """
 
     def __init__(self, prior=None, obstacles=(Plane(),), weights=None, samples=16, iterations=ITERATIONS, start="mode",
                  prior_at_first=False, contact=True, limits=project_range_of_motion, correction=True, restore=True,
-                 springs=()):  # fmt: skip
-        if start not in ("mode", "y"):
-            raise ValueError(f"start {start!r}: valid are mode, y")
+                 springs=(), wrench_limit=WRENCH_LIMIT, inside="free"):  # fmt: skip
+        for name, value, valid in (("start", start, ("mode", "y")), ("inside", inside, ("always", "never", "free"))):
+            if value not in valid:
+                raise ValueError(f"{name} {value!r}: valid are {', '.join(valid)}")
+        for name, value in (("samples", samples), ("iterations", iterations)):
+            if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < 1:
+                raise ValueError(f"{name} {value!r}: it must be a whole number of 1 or more")
+        for a, b, length, weight in springs:
+            if not (0 <= a < N and 0 <= b < N and a != b and 0 <= length < np.inf and 0 <= weight < np.inf):
+                raise ValueError(f"spring {(a, b, length, weight)}: two joints of 0 to {N - 1}, a length and a weight")
         self.prior, self.obstacles, self.w = prior, tuple(obstacles), weights or Weights()
+        if bad := [f"{k} {v}" for k, v in vars(self.w).items() if not 0 <= v < np.inf]:
+            raise ValueError(f"weights: {', '.join(bad)}; they must be 0 or more, and finite")
+        if not wrench_limit >= 0:
+            raise ValueError(f"wrench_limit {wrench_limit}: it must be 0 or more")
+        gaps(np.zeros((N, 3)), self.obstacles)  # complains if there are none
+        self.wrench_limit, self.inside = wrench_limit, inside
         self.samples, self.iterations, self.start, self.prior_at_first = samples, iterations, start, prior_at_first
         self.contact, self.limits, self.correction, self.restore = contact, limits, correction, restore
         ends = np.array([[a, b] for a, b, _, _ in springs], int).reshape(-1, 2)
@@ -687,22 +464,22 @@ class Simulator:
 
     # ---- the global step
 
-    def inverse(self, active, prior, outside=False, pinned=(), direction=False):
+    def inverse(self, active, prior, limited=False, pinned=(), direction=False):
         r"""The inverse of Eq. 4's matrix, times 1/h², for one set of active energies; computed once and kept.
 
         Equation  [DROP Eq. 4] M/h² + Σ_i w_i A_iᵀ A_i, divided by 1/h²
         Why       positive definite with a condition number below 100, so that an explicit inverse is as accurate as two
                   triangular solves and several times faster for 22 rows; x, y (and z without Eq. 16) share it
-        Args      active : (22,) bool; prior, outside : bool, E_kin and E_3 take part; pinned : joints; direction :
+        Args      active : (22,) bool; prior, limited : bool, E_kin and E_3 take part; pinned : joints; direction :
                   bool, the rank-one term of Eq. 16
         Returns   (22, 22)
         """
-        key = active.tobytes(), prior, outside, tuple(pinned), direction
+        key = active.tobytes(), prior, limited, tuple(pinned), direction
         if key not in self._inverses:
             if len(self._inverses) > 5000:
                 self._inverses.clear()
             w = self.w
-            diagonal = 1.0 + w.contact * active + w.range_of_motion * outside + w.prior * prior
+            diagonal = 1.0 + w.contact * active + w.range_of_motion * limited + w.prior * prior
             diagonal[list(pinned)] += w.constraint
             H = np.diag(diagonal) + self.JT @ self.A + (w.direction * np.ones((N, N)) if direction else 0.0)
             self._inverses[key] = cho_solve(cho_factor(H), np.eye(N))
@@ -714,13 +491,16 @@ class Simulator:
         Args      state : State; force : (22, 3) [N] or None; v_tar : (2,) [m/s] of Eq. 16; pins : {joint: (3,)} held by
                   E_constr = (w/2) ‖x_j − x_tar‖² (§8.2); rng : Generator for the samples
         Returns   State, Outcome
-        Raises    ValueError: a force, target or prior's output that is not finite or has a wrong shape
+        Raises    ValueError: a state, force, target or prior's output that is not finite or has a wrong shape
         """
-        x_t, v_t = state.x, state.v
+        x_t, v_t = _checked(state.x, (N, 3), "state's positions"), _checked(state.v, (N, 3), "state's velocities")
+        _unit(_checked(state.quat, (N, 4), "state's rotations"), "state's rotations")
         force = np.zeros((N, 3)) if force is None else _checked(force, (N, 3), "force")
         v_tar = None if v_tar is None else _checked(v_tar, (2,), "v_tar")
         pins = {} if pins is None else {int(j): _checked(p, (3,), f"pin of joint {j}") for j, p in pins.items()}
         pinned = tuple(sorted(pins))
+        if pinned and not 0 <= pinned[0] <= pinned[-1] < N:
+            raise ValueError(f"pins of joints {pinned}: joints are 0 to {N - 1}")
         targets = np.array([pins[j] for j in pinned]).reshape(-1, 3)
         w, y = self.w, inertial_target(x_t, v_t, force)
 
@@ -741,6 +521,8 @@ class Simulator:
                 twist_of[choice] = twists(rotations[choice])
             return twist_of[choice]
 
+        free = self.inside == "free" and len(samples) > 0 and v_tar is None and not pins
+        inside = self.inside == "always" or free  # does E_3 count where p = x
         for iteration in range(self.iterations):
             rhs = y + self.JT @ project_rigidity(x, self.A, self.lengths)
             active = np.zeros(N, bool)
@@ -749,37 +531,36 @@ class Simulator:
                 rhs += (w.contact * active)[:, None] * x_c
             if len(samples):
                 choice = project_prior(x, samples)
-            outside = (
-                False  # inside the limits p is x: a drag towards the last iterate, which freezes limp or led bodies
-            )
+            limited = False
             if self.limits:
                 x_r = self.limits(x, twist())
-                outside = x_r is not x or (len(samples) > 0 and v_tar is None and not pins)
-                rhs += w.range_of_motion * outside * x_r
+                limited = inside or bool(np.abs(x_r - x).max() > 1e-9)
+                rhs += w.range_of_motion * limited * x_r
             kinematic = len(samples) > 0 and (iteration > 0 or self.prior_at_first or self.start == "y")
             if kinematic:
                 rhs += w.prior * samples[choice]
             for j, target in zip(pinned, targets, strict=True):
                 rhs[j] += w.constraint * target
-            x = self.inverse(active, kinematic, outside, pinned) @ rhs
+            x = self.inverse(active, kinematic, limited, pinned) @ rhs
             if v_tar is not None:  # Eq. 16 acts on x and y only
                 along = rhs[:, :2] + w.direction * (x_t[:, :2].sum(axis=0) + STEP * N * v_tar)
-                x[:, :2] = self.inverse(active, kinematic, outside, pinned, True) @ along
+                x[:, :2] = self.inverse(active, kinematic, limited, pinned, True) @ along
         x_pd = x
 
         B, a = wrench_map(x_t, v_t, force)
         points, normals = self.touching(x_t, here)
         F, edges = friction_basis(points, normals, state.com)
         c, residual = contact_forces(F, B @ x.ravel() - a)
-        wrench_pd = wrench = float(np.sqrt(residual @ residual))
-        if self.correction and choice >= 0 and wrench_pd > WRENCH_LIMIT:  # only what is above the limit
-            x = soft_correction(x, B, residual * (1.0 - WRENCH_LIMIT / wrench_pd))
-            wrench = float(np.linalg.norm(residual + B @ (x - x_pd).ravel()))
+        wrench_pd = float(np.sqrt(residual @ residual))
+        if self.correction and choice >= 0 and wrench_pd > self.wrench_limit:  # only what is above the limit
+            x = soft_correction(x, B, residual * (1.0 - self.wrench_limit / wrench_pd))
         bone_error = float(np.abs(_lengths(x) / LENGTHS - 1).max())
         if self.restore:
             anchor = 1.0 + w.contact * active
             anchor[list(pinned)] += w.constraint
             x = restore_bones(x, anchor)
+        left = residual + B @ (x - x_pd).ravel()
+        wrench = float(np.sqrt(left @ left))
 
         solved = swing_twist(x, twist())
         quat = Rotation.from_matrix(solved[0]).as_quat(scalar_first=True)
@@ -791,9 +572,12 @@ class Simulator:
         return State(x, (x - x_t) / STEP, quat, state.frame + 1, own), found
 
     def touching(self, x, here=None):
-        """Points (P, 3) on the spheres' surfaces that may carry a contact force, and the normals there."""
+        """Points (P, 3) on the spheres' surfaces that may carry a contact force, and the normals there.
+
+        Eq. 11's contacts do not depend on the switch of Eq. 6: without any, Eq. 14 would enforce free fall.
+        Test: tests/test_drop.py::test_without_contact_the_prior_still_walks"""
         gap, normal = here or gaps(x, self.obstacles)
-        near = np.flatnonzero(gap < WRENCH_MARGIN) if self.contact else np.zeros(0, int)
+        near = np.flatnonzero(gap < WRENCH_MARGIN)
         return x[near] - RADII[near, None] * normal[near], normal[near]
 
     def energies(self, x, y, x_t, x_kin, twist, v_tar=None, pins=None, solved=None, here=None):
@@ -823,28 +607,30 @@ class Simulator:
         nothing = np.zeros((0, N, 3)), np.zeros((0, N, 4))
         if self.prior is None:
             return nothing
-        samples, rotations = self.prior.sample(state, self.samples, rng)
-        samples, rotations = np.asarray(samples, float), np.asarray(rotations, float)
-        if len(samples) == 0:
-            return nothing
-        mode, turned = self.prior.mode(state)
         name = f"prior {type(self.prior).__name__}"
-        _checked(samples, (len(samples), N, 3), f"{name}: positions")
-        _checked(rotations, (len(samples), N, 4), f"{name}: rotations")
-        _checked(mode, (N, 3), f"{name}: mode's positions"), _checked(turned, (N, 4), f"{name}: mode's rotations")
+        samples, rotations = _pair(self.prior.sample(state, self.samples, rng), f"{name}: sample")
+        if samples.shape[:1] == rotations.shape[:1] == (0,):
+            return nothing
+        m = max(samples.shape[:1], (1,))[0]
+        _checked(samples, (m, N, 3), f"{name}: positions")
+        _unit(_checked(rotations, (m, N, 4), f"{name}: rotations"), f"{name}: rotations")
+        mode, turned = _pair(self.prior.mode(state), f"{name}: mode")
+        _checked(mode, (N, 3), f"{name}: mode's positions")
+        _unit(_checked(turned, (N, 4), f"{name}: mode's rotations"), f"{name}: mode's rotations")
         return np.concatenate([mode[None], samples]), np.concatenate([turned[None], rotations])
 
     def begin(self, x, quat, v=None):
         """A State at rest or with velocities v, lifted until no sphere is in an obstacle.
 
         Test: tests/test_drop.py::test_starting_under_the_floor"""
-        x, v = np.array(x, float), np.zeros((N, 3)) if v is None else np.array(v, float)
+        x, quat = _checked(x, (N, 3), "positions").copy(), _checked(quat, (N, 4), "rotations")
+        v = np.zeros((N, 3)) if v is None else _checked(v, (N, 3), "velocities").copy()
         for _ in range(200):
             gap = gaps(x, self.obstacles)[0].min()
             if gap >= -1e-3:
                 break
             x[:, 2] += max(-gap, 1e-3)
-        return State(x, v, np.array(quat, float), 0, v.copy())
+        return State(x, v, _unit(quat, "rotations").copy(), 0, v.copy())
 
 
 def restore_bones(x, anchor, iterations=3):
@@ -879,13 +665,13 @@ def _lengths(x):
     return np.sqrt(np.einsum("ij,ij->i", bones, bones))
 
 
-def _checked(value, shape, name):
-    value = np.asarray(value, float)
-    if value.shape != shape:
-        raise ValueError(f"{name} has shape {value.shape}; it must be {shape}")
-    if not np.isfinite(value).all():
-        raise ValueError(f"{name} holds NaN or infinity")
-    return value
+def _pair(answer, name):
+    """The two arrays of a prior's answer."""
+    try:
+        x, quat = answer
+        return np.asarray(x, float), np.asarray(quat, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must return two arrays of numbers, positions and rotations") from None
 
 
 def main(argv=None):

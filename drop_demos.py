@@ -1,6 +1,6 @@
 r"""DROP's demonstrations  [DROP §8]: pushes, projectiles, collisions, constraints, platforms; measured and drawn.
 
-    python drop.py DEMO [--prior nearest] [--motion builtin] [--seed 0] [--png OUT.png] [--video OUT.mp4]
+    python drop.py DEMO [--prior nearest|vae] [--motion builtin] [--seed 0] [--png OUT.png] [--video OUT.mp4]
 
 push         torso, hand and foot, small and large (§8.1)          constrain    a hand held by a force, by an energy
 projectiles  balls thrown at a walker, who then dodges them        trip         the heel held for 1 s
@@ -8,6 +8,7 @@ collide      two characters, each an obstacle to the other         tilt         
 follow       a direction that turns every 4 s, 1.2 and 2.5 m/s,    stiff-knee   a strong spring from hip to heel
              and led by the hand                                   ragdoll      no prior
 backflip     a clip until the push, then the prior                 wrench       the root wrench of motions (Fig. 7)
+weights      a table: weights against 1/h²                          energies, ablations, failures: drop_figures.py
 all          every one of them
 
 Red: forces from outside.  Blue: the contact forces of Eq. 11.  `fell` is a pelvis below 0.6 of its standing height, or
@@ -16,8 +17,10 @@ a trunk more than 60 degrees from the vertical, at the end or for half a second.
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -28,7 +31,7 @@ import gait
 import mocap
 import render
 from drop import GRAVITY, LENGTHS, RADII, STANDING, STEP, J, N, Plane, Simulator, Spheres
-from drop_prior import ClipPrior, NearestPrior, SwitchPrior
+from drop_prior import WEIGHTS, ClipPrior, NearestPrior, PoseRange, SwitchPrior, VaePrior, load_networks
 from human import Clip, heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate
 from runs import NONNEGATIVE, UserError, arg, cli, run_main
 
@@ -37,8 +40,8 @@ from runs import NONNEGATIVE, UserError, arg, cli, run_main
 class Options:
     """What to show."""
 
-    prior: str = arg("nearest", "nearest transitions, the clip's next frame, or none (a rag doll)",
-                     choices=("nearest", "clip", "none"))  # fmt: skip
+    prior: str = arg("nearest", "nearest transitions, the learned prior, the clip's next frame, or none (a rag doll)",
+                     choices=("nearest", "vae", "clip", "none"))  # fmt: skip
     motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
     clips: str = arg("*", "shell pattern on clip names, for files and folders")
     seed: int = arg(0, "seed of the prior's samples", check=NONNEGATIVE)
@@ -47,6 +50,8 @@ class Options:
     correction: bool = arg(True, "the soft correction of the root wrench (Eq. 14)")
     contact: bool = arg(True, "the contact energy (Eq. 6)")
     limits: bool = arg(True, "the range-of-motion energy (Eq. 7)")
+    range: str = arg("limits", "range of motion: joint limits, or the pose VAE (Eq. 15)", choices=("limits", "vae"))
+    weights: str = arg(str(WEIGHTS), "of the learned priors, for `vae`")
 
 
 # ------------------------------------------------------------------------------------ motions
@@ -169,11 +174,33 @@ class Stage:
 
     def __init__(self, opt):
         self.opt, self.clips = opt, motions(opt)
-        self.nearest = NearestPrior([c[1:] for c in self.clips]) if opt.prior == "nearest" else None
+        self._wrench_limits = {}
+        self.general, self.limits = None, drop.project_range_of_motion if opt.limits else None
+        if "vae" in (opt.prior, opt.range):
+            motion, pose, meta = load_networks(opt.weights)
+            self.limits = PoseRange(pose, meta["bound"]) if opt.limits and opt.range == "vae" else self.limits
+        if opt.prior == "vae":
+            self.general = VaePrior(motion)
+        elif opt.prior == "nearest":
+            self.general = NearestPrior([c[1:] for c in self.clips])
+
+    def again(self):
+        """A generator with the seed of the options: takes that are compared draw the same numbers."""
+        return np.random.default_rng(self.opt.seed)
 
     def prior(self, x, quat, at):
         """The prior asked for; a clip's prior follows the clip the take starts from."""
-        return {"nearest": self.nearest, "clip": ClipPrior(x, quat, at), "none": None}[self.opt.prior]
+        return ClipPrior(x, quat, at) if self.opt.prior == "clip" else self.general
+
+    def wrench_limit(self, name, x, quat):
+        """What a clip needs itself: the 95th percentile of its root wrench, at least drop.WRENCH_LIMIT.
+
+        ASSUMED   the percentile.  A run drawn down to what a walk needs falls in its turns
+        Test: tests/test_drop_demos.py::test_wrench_limit_is_the_motions_own"""
+        if name not in self._wrench_limits:
+            own = np.percentile(root_wrench(x[:240], quat[:240]), 95)
+            self._wrench_limits[name] = max(drop.WRENCH_LIMIT, float(own))
+        return self._wrench_limits[name]
 
     def start(self, speed, at=60, prior=None, place=None, turn=0.0, **settings):
         """A simulator and its first state: frame `at` of the clip nearest to `speed`, moved to `place` (2,)."""
@@ -184,10 +211,11 @@ class Stage:
             pivot = x[at, 0] * [1, 1, 0]
             x = quat_rotate(np.broadcast_to(spin, x.shape[:2] + (4,)), x - pivot) + [*place, 0.0]
             quat = quat_mul(np.broadcast_to(spin, quat.shape), quat)
+        settings.setdefault("wrench_limit", self.wrench_limit(name, x, quat))
         o = self.opt
         sim = Simulator(prior or self.prior(x, quat, at), correction=o.correction, contact=o.contact,
-                        limits=drop.project_range_of_motion if o.limits else None, **settings)  # fmt: skip
-        if isinstance(sim.prior, NearestPrior):
+                        limits=self.limits, **settings)  # fmt: skip
+        if hasattr(sim.prior, "floor"):
             sim.prior.floor = None
         return sim, sim.begin(x[at], quat[at], (x[at] - x[at - 1]) / STEP)
 
@@ -222,6 +250,8 @@ def push(stage, rng):
     """§8.1: a sideways push of 0.27 s on torso, hand or foot of a walker and of a runner (--prior clip: tracked)."""
     takes = []
     for speed, word in ((1.2, "walk"), (2.5, "run")):
+        sim, state = stage.start(speed)
+        undisturbed = _centres(single("", sim, state, 180, stage.again(), lambda t, state: (None, {}, ())))
         for where, (joint, small, large) in PUSHES.items():
             for size, newton in (("small", small), ("large", large)):
                 if word == "run" and where != "torso":
@@ -229,11 +259,23 @@ def push(stage, rng):
                 sim, state = stage.start(speed)
                 left = quat_rotate(quat_about(2, heading(state.quat[0])), np.array([0.0, 1.0, 0.0]))
                 act = _pushing(joint, newton * left)
-                take = single(f"{word} {where} {size} {newton:.0f} N", sim, state, 180, rng, act)
+                take = single(f"{word} {where} {size} {newton:.0f} N", sim, state, 180, stage.again(), act)
                 take.window = (30, 94)
+                take.notes["away from the unpushed take"] = _displacement(take, undisturbed)
                 take.notes["impulse"] = f"{newton * np.diff(PUSH_FRAMES)[0] * STEP:.0f} N s on {N} kg"
                 takes.append(take)
     return takes
+
+
+def _centres(take):
+    """Centre of mass on the floor (T, 2) of a take's first character."""
+    return np.array([s[0].com[:2] for s in take.states])
+
+
+def _displacement(take, undisturbed):
+    away = 100 * np.linalg.norm(_centres(take) - undisturbed, axis=1)
+    later = away[: PUSH_FRAMES[1] + round(1 / STEP)][-1]
+    return f"{away[PUSH_FRAMES[1] - 1]:.1f} cm when the push ends, {later:.1f} 1 s later"
 
 
 def _pushing(joint, vector, frames=PUSH_FRAMES):
@@ -327,6 +369,9 @@ def projectiles(stage, rng):
 
         take = single("projectiles" + (" dodging" if dodge else ""), sim, state, 210, rng, act)
         take.notes["balls that hit"] = f"{len(seen)} of {len(balls)}"
+        size = [max((np.linalg.norm(f) for _, f in arrows), default=0.0) for arrows in take.arrows]
+        hit = int(np.argmax(size)) if seen else 40  # the sheet: every other frame around the hardest hit
+        take.window = (max(hit - 4, 0), min(hit + 12, len(size) - 1))
         takes.append(take)
     return takes
 
@@ -348,6 +393,7 @@ def collide(stage, rng):
             apart = np.linalg.norm(states[0].x[:, None] - states[1].x, axis=-1) - RADII[:, None] - RADII
             nearest = min(nearest, float(apart.min()))
             take.add(states, [o for _, o in steps])
+        take.window = (15, 75)
         take.notes["deepest overlap of the two"] = f"{max(-100 * nearest, 0):.1f} cm"
         takes.append(take)
     return takes
@@ -359,12 +405,18 @@ def follow(stage, rng):
     ASSUMED   v_tar points at the dot; its size is the dot's speed times the distance over 0.6 s of way, at most 1.25
     Test      tests/test_drop_demos.py::test_follower_keeps_the_speed
     """
-    return [_follow(stage, rng, speed, led) for speed, led in ((1.2, False), (2.5, False), (1.2, True), (2.5, True))]
+    takes = ((1.2, False), (2.5, False), (1.2, True), (2.5, True))
+    return [_follow(stage, stage.again(), speed, led) for speed, led in takes]
+
+
+LEAD_STIFFNESS, LEAD_LIMIT = 200.0, 40.0  # N/m, N, ASSUMED: the hand that leads
 
 
 def _follow(stage, rng, speed, led, frames=480):
     sim, state = stage.start(speed)
-    yaw, ahead = heading(state.quat[0]), 0.6 * speed
+    if isinstance(sim.prior, VaePrior):
+        sim.prior = VaePrior(sim.prior.net, spread=0.3)
+    yaw, ahead, reach = heading(state.quat[0]), 0.6 * speed, []
     way = lambda t: yaw + (t * STEP // 4) * np.pi / 2  # noqa: E731
     dot = state.com[:2] + ahead * np.array([np.cos(yaw), np.sin(yaw)])
 
@@ -375,10 +427,11 @@ def _follow(stage, rng, speed, led, frames=480):
         far = np.linalg.norm(gap)
         v = speed * gap / max(far, 1e-9) * min(far / ahead, 1.25)
         force = None
-        if led:  # the hand is drawn half an arm's length towards the dot, by at most 8 N
+        if led:  # the hand is drawn to a place half a metre towards the dot
             place = np.append(state.com[:2] + 0.5 * gap / max(far, 1e-9), 1.1)
-            pull = 40.0 * (place - state.x[J["wrist_r"]])
-            force = one_force("wrist_r", pull * min(1.0, 8.0 / max(np.linalg.norm(pull), 1e-9)))
+            pull = LEAD_STIFFNESS * (place - state.x[J["wrist_r"]])
+            force = one_force("wrist_r", pull * min(1.0, LEAD_LIMIT / max(np.linalg.norm(pull), 1e-9)))
+            reach.append(np.linalg.norm(place - state.x[J["wrist_r"]]))
         return force, {"v_tar": v}, [(np.append(dot, 0.06), 0.06, (0.9, 0.1, 0.1, 1))]
 
     take = single(f"follow {speed} m/s" + (" led by the hand" if led else ""), sim, state, frames, rng, act)
@@ -393,6 +446,8 @@ def _follow(stage, rng, speed, led, frames=480):
     take.notes["2 s after each turn"] = (
         f"{along:.2f} m/s along the dot's way, heading off by {np.degrees(off[late].mean()):.0f} degrees"
     )
+    if led:
+        take.notes["hand to the place it is led to"] = f"{100 * np.mean(reach):.0f} cm on average"
     return take
 
 
@@ -423,7 +478,7 @@ def constrain(stage, rng):
 
 def trip(stage, rng):
     """§8.2: the left heel of a walker and of a runner held for 1 s from when it swings past the other."""
-    return [_trip(stage, rng, 1.2), _trip(stage, rng, 2.5)]
+    return [_trip(stage, stage.again(), speed) for speed in (1.2, 2.5)]
 
 
 def _trip(stage, rng, speed, hold=30):
@@ -468,7 +523,7 @@ def tilt(stage, rng):
             normal = np.array([0, 0, np.cos(angle)]) + np.sin(angle) * np.cross(axis, [0, 0, 1.0])
             plane = Plane(normal, float(normal @ pivot))
             sim.obstacles = (plane,)
-            if isinstance(sim.prior, NearestPrior):
+            if hasattr(sim.prior, "floor"):
                 sim.prior.floor = plane
             return None, {}, ()
 
@@ -526,7 +581,7 @@ def backflip(stage, rng):
     landing = int(np.flatnonzero(up < -0.5)[-1])
     first, at = max(landing - 45, 1), min(landing + 12, len(x) - 2)
     onset = at - first
-    after = stage.nearest or ClipPrior(x, quat, first)
+    after = stage.general or ClipPrior(x, quat, first)
     sim, _ = stage.start(0.0, prior=SwitchPrior(ClipPrior(x, quat, first), after, onset))
     state = sim.begin(x[first], quat[first], (x[first] - x[first - 1]) / STEP)
     act = _pushing("spine3", np.array([0.0, 60.0, 0.0]), (onset, onset + 8))
@@ -609,24 +664,83 @@ def wrench(stage, rng):
     for correction in (False, True):
         sim, state = stage.start(2.5)
         sim.correction = correction
+        undisturbed = _centres(single("", sim, state, 120, stage.again(), lambda t, state: (None, {}, ())))
         act = _pushing("spine3", np.array([0.0, 120.0, 0.0]))
-        take = single(f"run pushed {'' if correction else 'un'}corrected", sim, state, 120, rng, act)
+        take = single(f"run pushed {'' if correction else 'un'}corrected", sim, state, 120, stage.again(), act)
         take.window = (30, 94)
-        after = slice(PUSH_FRAMES[0], PUSH_FRAMES[0] + 30)
-        before, left = (np.array([getattr(o[0], n) for o in take.outcomes])[after] for n in ("wrench_pd", "wrench"))
-        take.notes["root wrench in the second after the push"] = (
-            f"solved {np.median(before):.0f} (95 %: {np.percentile(before, 95):.0f}), "
-            f"in the motion {np.median(left):.0f} ({np.percentile(left, 95):.0f})"
-        )
+        pd, left = (np.array([getattr(o[0], n) for o in take.outcomes]) for n in ("wrench_pd", "wrench"))
+        for word, part in (("whole take", slice(None)), ("second from the push on", slice(30, 60))):
+            take.notes[f"root wrench, {word}"] = (
+                f"solved: median {np.median(pd[part]):.0f}, 95 % {np.percentile(pd[part], 95):.0f}; "
+                f"in the motion: {np.median(left[part]):.0f}, {np.percentile(left[part], 95):.0f}"
+            )
+        take.notes["away from the unpushed take"] = _displacement(take, undisturbed)
         takes.append(take)
     return takes
+
+
+SCALES = ((1, 3), (3, 9), (10, 30), (100, 3), (30, 9), (300, 9))  # w_1, and w_2, w_3, w_kin, of `weights`
+
+
+def weights(stage, rng):
+    """REPRODUCE.md's table of weights against 1/h²; prints, and has no take.
+
+    Columns   bone: largest error before lengths are restored, 100 N for 0.27 s on a walker's torso; hand: how far 100 N
+              move it by then; swing, period: the forearm released at 60 degrees from a held elbow, after 1/3 s; alone:
+              its bone error without restoring; walk, run: speed and foot slide of 3 s unperturbed
+    Test      tests/test_drop_demos.py::test_weights
+    """
+    print("w_1; others   bone     hand   swing   period    alone    walk          run")
+    nothing = lambda t, state: (None, {}, ())  # noqa: E731
+    for rigid, other in SCALES:
+        w = drop.Weights(rigid, other, other, other)
+        sim, state = stage.start(1.2, weights=w)
+        left = quat_rotate(quat_about(2, heading(state.quat[0])), np.array([0.0, 100.0, 0.0]))
+        torso, hand, free = (single("", sim, state, 18, stage.again(), act) for act in (
+            _pushing("spine3", left, (10, 18)), _pushing("wrist_l", left, (10, 18)), nothing))  # fmt: skip
+        bone = max(o[0].bone_error for o in torso.outcomes)
+        moved = np.linalg.norm((hand.states[-1][0].x - free.states[-1][0].x)[J["wrist_l"]])
+        (angle, _), (_, alone) = forearm(w), forearm(w, restore=False)
+        cross = np.flatnonzero(angle[:-1] * angle[1:] < 0)
+        at = cross + angle[cross] / (angle[cross] - angle[cross + 1])
+        gaits = []
+        for speed in (1.2, 2.5):
+            sim, state = stage.start(speed, weights=w)
+            gaits += measure(single("", sim, state, 90, stage.again(), nothing))
+        print(
+            f"{rigid:3d}; {other:3d}     {100 * bone:5.1f} %  {100 * moved:4.0f} cm  "
+            f"{np.degrees(angle[0] - angle[10]):4.1f}°  {2 * STEP * np.diff(at).mean():.3f} s  {100 * alone:5.2f} %   "
+            + "   ".join(f"{r['speed']:.2f}, {r['slide']:.2f}" for r in gaits)
+        )
+    return []
+
+
+def forearm(w, degrees=60.0, restore=True, steps=60):
+    """The left forearm swinging from a held elbow: angles (steps + 1,) [rad], largest relative error of the bone.
+
+    Test: tests/test_drop_demos.py::test_weights"""
+    sim = Simulator(None, weights=replace(w, constraint=1e5), contact=False, limits=None, restore=restore)
+    rest = np.tile([1.0, 0.0, 0.0, 0.0], (N, 1))
+    x, e, k = drop.forward_kinematics(drop.OFFSETS[0], rest), J["elbow_l"], J["wrist_l"]
+    theta = np.radians(degrees)
+    x[k] = x[e] + LENGTHS[k - 1] * np.array([np.sin(theta), 0.0, -np.cos(theta)])
+    pins = {j: x[j].copy() for j in range(N) if j != k}
+    state, angles, worst = sim.begin(x, rest), [theta], 0.0
+    for _ in range(steps):
+        state, _ = sim.step(state, pins=pins)
+        bone = state.x[k] - state.x[e]
+        angles.append(np.arctan2(bone[0], -bone[2]))
+        worst = max(worst, abs(np.linalg.norm(bone) / LENGTHS[k - 1] - 1))
+    return np.array(angles), worst
 
 
 DEMOS = {
     "push": push, "projectiles": projectiles, "collide": collide, "follow": follow, "constrain": constrain,
     "trip": trip,
     "tilt": tilt, "stiff-knee": stiff_knee, "ragdoll": ragdoll, "wrench": wrench, "backflip": backflip,
+    "weights": weights,
 }  # fmt: skip
+FIGURES = ("energies", "ablations", "failures")  # drop_figures.py
 
 
 # ------------------------------------------------------------------------------------ pictures
@@ -636,8 +750,9 @@ WORLD = """<mujoco><visual><map zfar="60"/>
 <asset><texture name="t" type="2d" builtin="checker" rgb1=".82 .84 .86" rgb2=".70 .73 .76" width="200" height="200"/>
 <material name="m" texture="t" texrepeat="1 1" texuniform="true"/>
 <texture type="skybox" builtin="gradient" rgb1=".95 .97 1" rgb2=".75 .82 .9" width="64" height="64"/></asset>
-<worldbody><light pos="2 -2 6" dir="-.3 .3 -1" directional="true" diffuse=".5 .5 .5"/>
-<body name="floor" mocap="true"><geom type="plane" size="40 40 .1" material="m"/></body></worldbody></mujoco>"""
+<worldbody><body name="floor" mocap="true"><geom type="plane" size="40 40 .1" material="m"/></body>
+<body name="light" mocap="true"><light pos="2 -2 6" dir="-.3 .3 -1" directional="true" diffuse=".5 .5 .5"/></body>
+</worldbody></mujoco>"""
 COLOURS = ((0.25, 0.5, 0.85, 1.0), (0.85, 0.5, 0.25, 1.0))
 
 
@@ -652,16 +767,25 @@ def body_shapes(x, rgba):
     return shapes + [render.Marker(x[J["head"]] + [0, 0, 0.02], None, rgba, 0.1)]
 
 
-def arrow(place, vector, rgba, scale=0.005, longest=0.8):
-    """A force as an arrow that ends at `place`.  Test: tests/test_drop_demos.py::test_shapes_and_arrows"""
+def arrow(place, vector, rgba, scale=0.005, longest=0.8, leaves=False):
+    """A force as an arrow that ends at `place`; or that leaves it, as a floor's does, which would be hidden below.
+
+    Test: tests/test_drop_demos.py::test_shapes_and_arrows, ::test_contact_forces_are_drawn_above_the_floor"""
     v = scale * np.asarray(vector)
     v = v * min(1.0, longest / max(np.linalg.norm(v), 1e-9))
     if np.linalg.norm(v) < 0.02:
         return []
+    place = place + v if leaves else place
     return [
         render.Bone(place - v, place - 0.12 * v, rgba, 0.012),
         render.Bone(place - 0.2 * v, place - 0.1 * v, rgba, 0.03),
     ]
+
+
+def contact_arrows(found):
+    """An Outcome's contact forces.  Test: tests/test_drop_demos.py::test_contact_forces_are_drawn_above_the_floor"""
+    arrows = (arrow(p, f, (0.1, 0.2, 0.9, 1.0), 0.002, leaves=True) for p, f in zip(found.points, found.forces))
+    return [shape for shapes in arrows for shape in shapes]
 
 
 def draw(scene, data, take, t):
@@ -669,13 +793,13 @@ def draw(scene, data, take, t):
     floor = take.floor[t]
     turn = np.cross([0, 0, 1.0], floor.normal)
     data.mocap_quat[0] = np.append(1.0 + floor.normal[2], turn) / np.linalg.norm(np.append(1.0 + floor.normal[2], turn))
-    data.mocap_pos[0] = floor.offset * floor.normal
+    centre = np.mean([s.com for s in take.states[t]], axis=0)
+    data.mocap_pos[:] = floor.offset * floor.normal, centre * [1, 1, 0]  # the light goes along, or shadows end
     mujoco.mj_forward(scene.model, data)
-    shapes, centre = [], np.mean([s.com for s in take.states[t]], axis=0)
+    shapes = []
     for k, (state, found) in enumerate(zip(take.states[t], take.outcomes[t])):
         shapes += body_shapes(state.x, COLOURS[k % 2])
-        for p, f in zip(found.points, found.forces):
-            shapes += arrow(p, f, (0.1, 0.2, 0.9, 1.0), 0.002)
+        shapes += contact_arrows(found)
     for p, f in take.arrows[t]:
         shapes += arrow(p, f, (0.9, 0.1, 0.1, 1.0), 0.008)
     shapes += [
@@ -684,7 +808,8 @@ def draw(scene, data, take, t):
     camera = mujoco.MjvCamera()
     ground = (floor.offset - floor.normal[:2] @ centre[:2]) / floor.normal[2]
     camera.lookat[:] = [centre[0], centre[1], 0.8 + ground]
-    camera.distance, camera.azimuth, camera.elevation = (3.2 if len(take.states[t]) == 1 else 4.2), 130, -14
+    apart = max(np.linalg.norm(s.com - centre) for s in take.states[t])
+    camera.distance, camera.azimuth, camera.elevation = (4.0 if apart else 3.2) + 2.0 * apart, 130, -14
     return scene.frame(data, camera, shapes)
 
 
@@ -694,6 +819,7 @@ def write_pictures(takes, opt, columns=9):
     data = mujoco.MjData(model)
     if opt.png:
         scene = render.Scene(model, 240, 300, camera=mujoco.MjvCamera(), fast=True)
+        scene.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = True  # they show which foot stands
         frames, labels = [], []
         for take in takes:
             shown = np.linspace(*(take.window or (0, len(take.states) - 1)), columns).round().astype(int)
@@ -714,16 +840,35 @@ def write_pictures(takes, opt, columns=9):
         print(opt.video)
 
 
+def check_outputs(opt):
+    """Can the pictures be written?  Before the slow work.
+
+    Test: tests/test_drop_demos.py::test_outputs_are_checked_first"""
+    for path in map(Path, filter(None, (opt.png, opt.video))):
+        if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+            raise UserError(f"cannot write {path}: give a file in a folder that exists and is writable")
+    if opt.video:
+        render._extra("imageio")
+
+
 def main(argv=None):
     """Run one demonstration, print what it measured, draw it.  Test: tests/test_drop_demos.py::test_command"""
     argv = list(sys.argv[1:] if argv is None else argv)
-    names = [*DEMOS, "all"]
+    names = [*DEMOS, "all", *FIGURES]
     name = argv.pop(0) if argv and not argv[0].startswith("-") else None
+    if name in FIGURES:
+        import drop_figures
+
+        return drop_figures.main(name, argv)
+    if name is None and (late := next((a for a in argv if a in names), None)):
+        rest = " ".join(a for a in argv if a != late)
+        raise UserError(f"the demonstration comes first: drop.py {late} {rest}")
     opt = cli(Options, argv, f"drop.py {name or 'DEMO'}", __doc__)
     if name not in names:
         raise UserError(
             f"drop.py needs a demonstration{'' if name is None else f', not {name!r}'}; valid: {', '.join(names)}"
         )
+    check_outputs(opt)
     stage, takes = Stage(opt), []
     print(f"{len(stage.clips)} clips, {sum(len(c[1]) for c in stage.clips) * STEP / 60:.1f} min; prior {opt.prior}")
     for each in DEMOS if name == "all" else [name]:
@@ -736,7 +881,7 @@ def main(argv=None):
         takes += DEMOS[each](stage, np.random.default_rng(opt.seed))
     for take in takes:
         print(report(take))
-    if opt.png or opt.video:
+    if takes and (opt.png or opt.video):
         write_pictures(takes, opt)
 
 

@@ -1,4 +1,4 @@
-r"""Motion priors for DROP's simulator that need no training  [DROP §5].
+r"""Motion priors for DROP's simulator  [DROP §5]: a clip, nearest transitions of recorded motion, a conditional VAE.
 
 A prior is anything with
 
@@ -8,14 +8,23 @@ A prior is anything with
 `state` is a `drop.State`: x and v hold the solved motion, v_own the velocities the prior itself predicted, which §7
 does not overwrite.  Positions are bones of the right lengths, rotations global, both in the world frame.  m = 0 says
 that nothing fits here; that step is a rag doll's.
+
+    python drop_prior.py train|evaluate|rollout|ship --motion FOLDER     the VAEs of drop_vae.py (drop_train.py)
 """
 
 from __future__ import annotations
 
+import functools
+from pathlib import Path
+
 import numpy as np
 
-from drop import STEP, J, N, forward_kinematics
+import drop_vae as vae
+from drop import OFFSETS, PARENTS, PATH, STEP, J, N, align, forward_kinematics, swing_twist
 from human import heading, quat_conj, quat_mul
+from runs import UserError, load_checkpoint, run_main
+
+WEIGHTS = Path(__file__).resolve().parent / "weights" / "drop.npz"
 
 
 class ClipPrior:
@@ -100,7 +109,15 @@ class NearestPrior:
         self.basis = vt[:components].T
         self.bank = ((f - self.mean) @ self.basis).astype(np.float32)
         self.norm = np.einsum("ij,ij->i", self.bank, self.bank)
-        self._last = self._mode = None
+
+    @property
+    def floor(self):
+        """Plane under the character, or None.  Test: tests/test_drop.py::test_nearest_prior_sees_a_new_floor"""
+        return self._floor
+
+    @floor.setter
+    def floor(self, plane):
+        self._floor, self._last, self._mode = plane, None, None  # what was found over another floor is void
 
     def features(self, x, v, quat):
         """(T, 72) features whose distances are RMS metres a joint.  x, v (T, 22, 3), quat (T, 22, 4)."""
@@ -113,8 +130,7 @@ class NearestPrior:
 
     def ground(self, x):
         """Height of the floor under the pelvis of x (22, 3) [m]."""
-        f = self.floor
-        return 0.0 if f is None else (f.offset - f.normal[:2] @ x[0, :2]) / f.normal[2]
+        return ground(self.floor, x)
 
     def nearest(self, state, n):
         """Numbers of the n nearest frames, nearest first, and the distance of the nearest [m]."""
@@ -176,3 +192,130 @@ class NearestPrior:
         if self._last is None or self._last[0] is not state or len(self._last[1]) < min(n, len(self.norm)):
             self._last = state, *self.nearest(state, n)
         return self._last[1:]
+
+
+# ------------------------------------------------------------------------------------ learned
+
+
+class VaePrior:
+    r"""The conditional VAE of drop_vae.py as a prior  [DROP Eqs. 8, 9].
+
+    Equation  z ~ N(μ0(s), σ0(s)²) for the set of samples, z = μ0(s) for the mode; x̃ by forward kinematics of the
+              decoded rotations
+    Args      net : drop_vae.MotionVAE; floor : Plane under the character or None; velocity : "own" (§7: what the prior
+              itself predicted) or "solved" (differences of the solved positions); spread : standard deviation of the
+              angle [rad] by which samples, not the mode, are turned about the pelvis, as NearestPrior's are
+    ASSUMED   spread 0, and 0.3 where a direction leads (drop_demos.follow): trained on few turns, z alone does not turn
+    Test      tests/test_drop_vae.py::test_vae_prior
+    """
+
+    def __init__(self, net, floor=None, velocity="own", spread=0.0):
+        if velocity not in ("own", "solved"):
+            raise ValueError(f"velocity {velocity!r}: valid are own, solved")
+        self.net, self.floor, self.velocity, self.spread = net, floor, velocity, spread
+        self._mode = None
+
+    def sample(self, state, n, rng):
+        """n samples; without rng the mode alone."""
+        net = self.net
+        lift = np.array([0.0, 0.0, ground(self.floor, state.x)])
+        v = state.v if self.velocity == "solved" or state.v_own is None else state.v_own
+        here = state.x - lift - state.x[0] * [1, 1, 0]
+        one = [np.asarray(a, np.float32)[None] for a in (here, vae.columns_of(state.quat), v)]
+        x, columns, v, frame = vae.canonical(*one)
+        s = net.normalise(vae.state_vector(x, columns, v))
+        mu, log_std, _ = net.gaussian("prior", s)
+        z = np.repeat(mu, 1 + (n if rng is not None else 0), axis=0)
+        if rng is not None:
+            z[1:] += np.exp(log_std) * rng.standard_normal((n, net.latent)).astype(np.float32)
+        out, C = net.decode(np.repeat(s, len(z), axis=0), z, x[0, 0, 2], columns)
+        angle = np.full(len(z), np.arctan2(frame[1][0], frame[0][0]), float)
+        if rng is not None and self.spread:
+            angle[1:] += rng.normal(0.0, self.spread, n)
+        spin = np.zeros((len(z), 3, 3))
+        spin[:, 0, 0] = spin[:, 1, 1] = np.cos(angle)
+        spin[:, 1, 0], spin[:, 0, 1], spin[:, 2, 2] = np.sin(angle), -np.sin(angle), 1.0
+        # float64 again: positions by kinematics of the rotations found (orthonormal to 1e-7)
+        R = np.matmul(spin[:, None], np.swapaxes(C, -1, -2).astype(float))
+        bones = np.matmul(R[:, PARENTS[1:]], OFFSETS[1:, :, None])[..., 0]
+        root = np.matmul(spin, out[:, 0, :, None].astype(float))[..., 0] + state.x[0] * [1, 1, 0] + lift
+        quat = vae.quat_of(R)
+        found = root[:, None] + PATH @ bones
+        self._mode = state, found[0], quat[0]
+        return (found[1:], quat[1:]) if rng is not None else (found, quat)
+
+    def mode(self, state):
+        """The prior's mean latent, decoded."""
+        if self._mode is None or self._mode[0] is not state:
+            self.sample(state, 0, None)
+        return self._mode[1:]
+
+
+class PoseRange:
+    r"""Range of motion by the pose VAE: `limits` of drop.Simulator  [DROP Eqs. 7, 15].
+
+    Equation  [DROP Eq. 15] q_r = D(r E(q)/‖E(q)‖) if ‖E(q)‖ > r, else q; then forward kinematics, laid on x as a rigid
+              body as `drop.project_range_of_motion` does
+    ASSUMED   r: 6 belongs to VPoser; ours is the 99.9th percentile of ‖E‖ over held-out poses
+    Args      net : drop_vae.PoseVAE; bound : r
+    Test      tests/test_drop_vae.py::test_pose_range
+    """
+
+    def __init__(self, net, bound):
+        self.net, self.bound = net, float(bound)
+
+    def norm(self, C):
+        """‖E(q)‖ (B,) of rotations (B, 22, 3, 3), whose rows are the columns."""
+        return np.linalg.norm(self.net.encode(vae.pose_columns(C)), axis=1)
+
+    def __call__(self, x, twist):
+        R, _ = swing_twist(x, twist)
+        C = np.swapaxes(R, -1, -2)[None].astype(np.float32)
+        z = self.net.encode(vae.pose_columns(C))
+        norm = float(np.sqrt(z[0] @ z[0]))
+        if not norm > self.bound:
+            return x
+        inside = self.net.decode(z * np.float32(self.bound / norm))[0].astype(float)
+        out = PATH @ np.matmul(OFFSETS[1:, None], inside[PARENTS[1:]])[:, 0]
+        out, centre = out - out.mean(axis=0), x.mean(axis=0)
+        return out @ align(out[None], (x - centre)[None])[0].T + centre
+
+
+def ground(floor, x):
+    """Height of a floor (Plane or None) under the pelvis of x (22, 3) [m]."""
+    return 0.0 if floor is None else (floor.offset - floor.normal[:2] @ x[0, :2]) / floor.normal[2]
+
+
+@functools.cache
+def load_networks(path=WEIGHTS):
+    r"""Both VAEs of a file that `drop_prior.py ship` wrote, or of a run folder's checkpoint.
+
+    Returns   MotionVAE, PoseVAE, meta
+    Raises    UserError: no such file, not such a file, or non-finite numbers
+    Test      tests/test_drop_vae.py::test_shipped
+    """
+    arrays, meta = load_checkpoint(path, ("motion.*", "pose.*"))
+    try:
+        o = meta["options"]
+        pick = lambda net, names: {k: arrays[f"{net}.{k}"] for k in names}  # noqa: E731
+        rng = np.random.default_rng(0)
+        motion = vae.MotionVAE(o["latent"], o["hidden"], pick("motion", ("mean", "std", "scale", "offset")), rng)
+        pose = vae.PoseVAE(o["pose_latent"], o["pose_hidden"], pick("pose", ("mean", "std")), rng)
+        for name, net in vae.networks(motion, pose).items():
+            if arrays[name].shape != net.theta.shape:
+                raise ValueError(f"{name} has {arrays[name].size} weights, not {net.n_params}")
+            net.theta[:] = arrays[name]
+    except (KeyError, TypeError, ValueError) as e:
+        raise UserError(f"{path}: not DROP's priors ({e}); valid: a file that drop_prior.py ship wrote") from None
+    return motion, pose, meta
+
+
+def main(argv=None):
+    """python drop_prior.py train|evaluate|rollout|ship.  Test: tests/test_drop_vae.py::test_command"""
+    import drop_train
+
+    return drop_train.main(argv)
+
+
+if __name__ == "__main__":
+    run_main(main)

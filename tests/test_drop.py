@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 import drop
+import drop_body
 import gait
 from drop import (
     AXIS,
@@ -144,6 +145,26 @@ def test_energy_gradients():
         assert value > 0, name
         expected = numerical(lambda z, f=f: f(z)[0], at)
         np.testing.assert_allclose(gradient, expected, atol=1e-5 * np.abs(expected).max(), err_msg=name)
+    # Pose limits and a pin: the gradient of (w/2) ‖x − p‖² holds p fixed.  For a pin p is fixed; the limits' projection
+    # lays the moved pose on x, so its value must fall along its own negative gradient at the rate the gradient says,
+    # but for the change of the pose inside.
+    knee = np.zeros((1, N))
+    knee[0, J["hip_l"]], knee[0, J["ankle_l"]] = -1.0, 1.0
+    pin = np.zeros((1, N))
+    pin[0, J["wrist_r"]] = 1.0
+    for name, A, project in (
+        ("positional constraint", pin, lambda x: np.array([[0.3, -0.2, 1.0]])),
+        ("stiff knee", knee, lambda x: drop.project_rigidity(x, knee, np.array([0.85]))),
+    ):
+        value, gradient = drop.spring(7.0, A, x, project(x))
+        assert value > 0, name
+        expected = numerical(lambda z, A=A, p=project: drop.spring(7.0, A, z, p(z))[0], x)
+        np.testing.assert_allclose(gradient, expected, atol=1e-6 * np.abs(expected).max(), err_msg=name)
+    limit = lambda z: drop.spring(9.0, eye, z, drop.project_range_of_motion(z, twist))  # noqa: E731
+    value, gradient = limit(bent)
+    step = 1e-6 * gradient / np.linalg.norm(gradient)
+    rate = (limit(bent + step)[0] - limit(bent - step)[0]) / 2e-6
+    assert value > 0 and 0.5 < rate / np.linalg.norm(gradient) < 1.5
     r = bent - drop.project_range_of_motion(bent, twist)
     assert np.sum(r * r) > 1e-3
     np.testing.assert_allclose(r.sum(axis=0), 0, atol=1e-12)  # no net force
@@ -260,8 +281,8 @@ def test_swing_twist():
     s = drop.swing(a, b)
     np.testing.assert_allclose(Rotation.from_rotvec(s).apply(a), b, atol=1e-7)
     np.testing.assert_allclose(np.linalg.norm(s, axis=1), np.arccos(np.clip(np.sum(a * b, axis=1), -1, 1)), atol=1e-7)
-    np.testing.assert_allclose(drop._turn(s), Rotation.from_rotvec(s).as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(drop._swing_matrix(a, b), Rotation.from_rotvec(s).as_matrix(), atol=1e-7)
+    np.testing.assert_allclose(drop_body._turn(s), Rotation.from_rotvec(s).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(drop_body._swing_matrix(a, b), Rotation.from_rotvec(s).as_matrix(), atol=1e-7)
     o, p = rng.standard_normal((2, 5, 3))
     np.testing.assert_allclose(drop.align(o[None], p[None])[0], Rotation.align_vectors(p, o)[0].as_matrix(), atol=1e-9)
     turn = Rotation.from_rotvec(0.7 * AXIS[1])  # a twist of the hip is read off as it is
@@ -604,16 +625,80 @@ def test_switches():
     force = np.zeros((N, 3))
     force[J["spine3"], 1] = 300.0
     run = lambda **kw: Simulator(prior(), **kw).step(state, force, rng=np.random.default_rng(0))  # noqa: E731
-    assert (
-        run()[1].wrench < run()[1].wrench_pd - 20
-        and run(correction=False)[1].wrench == run(correction=False)[1].wrench_pd
-    )
+    assert run()[1].wrench < run()[1].wrench_pd - 20
+    as_it_is, out = run(correction=False)
+    assert out.wrench == pytest.approx(out.wrench_pd, rel=0.05)
+    # the metric is of the motion itself, bones restored: with the forces that were found, from the positions
+    B, a = drop.wrench_map(state.x, state.v, force)
+    found = np.concatenate([out.forces.sum(axis=0), np.cross(out.points - state.com, out.forces).sum(axis=0)])
+    assert out.wrench == pytest.approx(np.linalg.norm(B @ as_it_is.x.ravel() - a - found), rel=1e-6)
     assert np.abs(run(limits=None)[0].x - run()[0].x).max() > 0
     assert np.abs(run(start="y")[0].x - run()[0].x).max() > 0
     assert np.abs(run(prior_at_first=True)[0].x - run()[0].x).max() > 0
     assert np.abs(np.linalg.norm(DIFFERENCE @ run(restore=False)[0].x, axis=1) / LENGTHS - 1).max() > 1e-4
     with pytest.raises(ValueError, match="mode, y"):
         Simulator(None, start="x")
+
+
+def test_without_contact_the_prior_still_walks():
+    """§8.3's switch is Eq. 6's alone: Eq. 11's contacts stay, or Eq. 14 would make the walker fall freely."""
+    sim, rng = Simulator(prior(), contact=False), np.random.default_rng(0)
+    state = state_of(sim)
+    height = [state.com[2]]
+    for _ in range(60):
+        state, out = sim.step(state, rng=rng)
+        height.append(state.com[2])
+        assert not out.active.any()
+    assert np.ptp(height) < 0.1 and len(out.points)
+
+
+def test_energy_inside_the_limits():
+    """With p = x E_3 holds a body where it is "always", never "never"; "free": only where the prior alone drives.
+
+    Whether a pose is inside is seen from the numbers: a projection that returns a copy is the same projection."""
+    state = state_of(Simulator(None))
+    pins = {J["wrist_l"]: state.x[J["wrist_l"]] + 0.05}
+
+    def run(inside, pins=None, limits=drop.project_range_of_motion):
+        sim = Simulator(prior(), inside=inside, limits=limits)
+        return sim.step(state, pins=pins, rng=np.random.default_rng(0))[0].x
+
+    assert np.abs(run("always") - run("never")).max() > 1e-4
+    np.testing.assert_array_equal(run("free"), run("always"))
+    np.testing.assert_array_equal(run("free", pins), run("never", pins))
+    assert np.abs(run("always", pins) - run("never", pins)).max() > 1e-5
+    copy = lambda x, twist: drop.project_range_of_motion(x, twist).copy()  # noqa: E731
+    np.testing.assert_array_equal(run("never", limits=copy), run("never"))
+
+
+def test_a_small_push_is_not_swallowed():
+    """40 N for 0.27 s move a walker visibly; where nothing is corrected a phantom wrench bears them."""
+
+    def centre(newton, **settings):
+        sim, rng = Simulator(prior(), **settings), np.random.default_rng(0)
+        state, force = state_of(sim), np.zeros((N, 3))
+        force[J["spine3"], 1] = newton
+        for t in range(13):
+            state, _ = sim.step(state, force if t >= 5 else None, rng=rng)
+        return state.com[1]
+
+    moved = centre(40.0) - centre(0.0)
+    free = 40.0 / N * STEP**2 * 8 * 9 / 2  # 7 cm, without anything to hold it
+    assert 0.2 * free < moved < 1.2 * free
+    assert centre(40.0, wrench_limit=1e9) - centre(0.0, wrench_limit=1e9) < 0.3 * moved
+    assert drop.WRENCH_LIMIT <= 15.0
+
+
+def test_standing_on_a_box():
+    """A limp body that falls on a box lies on it, and not in it or on the floor below."""
+    x, quat = (a[30] for a in motion("stand"))
+    box = Box(np.array([*x[0, :2], 0.2]), np.array([1.5, 1.5, 0.2]))
+    sim = Simulator(None, obstacles=(Plane(), box))
+    state = sim.begin(x, quat)
+    assert (state.x[:, 2] - RADII).min() == pytest.approx(0.4, abs=0.01)
+    for _ in range(60):
+        state, out = sim.step(state)
+    assert out.active.any() and (state.x[:, 2] - RADII).min() > 0.4 - 0.05 and state.com[2] < 0.8
 
 
 def test_stiff_knee_spring():
@@ -723,6 +808,106 @@ def test_bad_input():
     doll, _ = Simulator(None).step(state)
     np.testing.assert_array_equal(nothing.x, doll.x)
     assert out.sample == -1
+
+
+@pytest.mark.parametrize("answer", [None, (None, None), 3, ("a", "b"), ([[1.0], [2.0, 3.0]], [[1.0]]), (1.0, 2.0)])
+def test_a_prior_without_arrays(answer):
+    """Whatever `sample` or `mode` returns, the error is one line that names the prior."""
+    state = state_of(Simulator(None))
+
+    class Odd(Broken):
+        def sample(self, state, n, rng):
+            return answer
+
+    class Modeless(Broken):
+        def mode(self, state):
+            return answer
+
+    for kind in (Odd, Modeless):
+        with pytest.raises(ValueError, match=f"prior {kind.__name__}: ") as error:
+            Simulator(kind(state.x[None], state.quat[None])).step(state)
+        assert "\n" not in str(error.value)
+
+
+def test_priors_with_lists_and_without_rotations():
+    """Lists of numbers do; quaternions of length 0 do not."""
+    state = state_of(Simulator(None))
+
+    class Lists(Broken):
+        def sample(self, state, n, rng):
+            return self.x.tolist(), self.quat.tolist()
+
+        def mode(self, state):
+            return state.x.tolist(), state.quat.tolist()
+
+    x, quat = state.x[None], state.quat[None]
+    got, _ = Simulator(Lists(x, quat)).step(state)
+    np.testing.assert_array_equal(got.x, Simulator(Broken(x, quat)).step(state)[0].x)
+    with pytest.raises(ValueError, match="prior Broken: rotations: quaternions have length 1, not 0"):
+        Simulator(Broken(x, 0 * quat)).step(state)
+
+
+def test_bad_settings():
+    """What a simulator cannot be made with: one line each."""
+    for wrong, words in (
+        ({"samples": 0}, "samples 0"), ({"samples": -1}, "samples -1"), ({"samples": 1.5}, "samples 1.5"),
+        ({"samples": True}, "samples True"), ({"iterations": 0}, "iterations 0"), ({"inside": "x"}, "always, never"),
+        ({"obstacles": ()}, "no obstacles"), ({"weights": Weights(contact=-1.0)}, "contact -1"),
+        ({"weights": Weights(prior=np.nan)}, "prior nan"), ({"wrench_limit": -1.0}, "wrench_limit -1"),
+        ({"springs": ((0, 99, 1.0, 1.0),)}, "joints of 0 to 21"), ({"springs": ((0, 7, 1.0, np.nan),)}, "spring"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            Simulator(None, **wrong)
+    assert Simulator(None, samples=np.int64(1), iterations=1).samples == 1
+
+
+def test_bad_states():
+    """A state that is no state is said to be one, before anything is computed with it."""
+    sim = Simulator(prior())
+    state = state_of(sim)
+    nan, x, v, quat = state.x * np.nan, state.x, state.v, state.quat
+    for bad, words in (
+        (State(nan, v, quat), "state's positions holds NaN"), (State(x, nan, quat), "state's velocities holds NaN"),
+        (State(x[:5], v, quat), "state's positions has shape"), (State(x, v, 0 * quat), "state's rotations: quat"),
+        (State(x, 1e300 * v, quat), r"state's velocities holds values beyond 1e\+09"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            sim.step(bad)
+    for args, words in (((nan, quat), "positions holds NaN"), ((x[:5], quat), r"positions has shape \(5, 3\)"),
+                        ((x, quat, nan), "velocities holds NaN"), ((x, 0 * quat), "length 1, not 0")):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            sim.begin(*args)
+    for joint in (99, -1):
+        with pytest.raises(ValueError, match="joints are 0 to 21"):
+            sim.step(state, pins={joint: np.zeros(3)})
+    with pytest.raises(ValueError, match=r"force holds values beyond 1e\+09"):
+        sim.step(state, np.full((N, 3), 1e300))
+    assert np.isfinite(sim.step(state, np.full((N, 3), 1e9), rng=np.random.default_rng(0))[0].x).all()
+
+
+def test_bad_obstacles():
+    """A normal of any length is the same half space; of none, an error.  A box's turn must be one."""
+    x = np.random.default_rng(0).standard_normal((20, 3))
+    d, n = Plane(np.array([0.0, 3.0, 4.0]), 5.0).distance(x)
+    np.testing.assert_allclose(d, x @ [0.0, 0.6, 0.8] - 1.0)
+    np.testing.assert_allclose(n[0], [0.0, 0.6, 0.8])
+    for normal, offset in ((np.zeros(3), 0.0), (np.array([0.0, 0.0, 1.0]), np.nan)):
+        with pytest.raises(ValueError, match="no half space"):
+            Plane(normal, offset)
+    with pytest.raises(ValueError, match="Plane: normal holds NaN"):
+        Plane(np.full(3, np.nan))
+    with pytest.raises(ValueError, match="Box: quat: quaternions have length 1, not 2"):
+        Box(np.zeros(3), np.ones(3), np.array([2.0, 0.0, 0.0, 0.0]))
+
+
+def test_nearest_prior_sees_a_new_floor():
+    """What was found over one floor is not used over another, for the same state."""
+    p, (x, quat) = NearestPrior([motion()]), motion()
+    state = State(x[50], (x[50] - x[49]) / STEP, quat[50])
+    level = p.mode(state)[0]
+    p.floor = Plane(offset=-0.1)
+    np.testing.assert_array_equal(p.mode(state)[0], NearestPrior([motion()], floor=Plane(offset=-0.1)).mode(state)[0])
+    assert np.abs(p.mode(state)[0] - level).max() > 0.01
 
 
 def test_starting_under_the_floor():

@@ -1,0 +1,1 @@
+"""Trained networks that are no character's, as package data."""
