@@ -345,15 +345,20 @@ def shipped():
 
 
 def test_shipped():
-    """Small, licensed, no posterior collapse; better than going on as before on the built-in walk."""
-    motion_net, pose, meta = shipped()
+    """Small, licensed."""
+    _, _, meta = shipped()
     assert drop_prior.WEIGHTS.stat().st_size < 4e6
     assert "bandai" in meta["licence"] and "NonCommercial" in meta["licence"] and meta["options"]["motion"] == "bandai"
     assert meta["bound"] > 1 and meta["updates"] >= 1000
-    r = training.Recording([motion("walk", 6.0, 3)])
-    linear = training.LinearAR(motion_net, r, n=300)
+
+
+def test_shipped_on_held_out_clips(mocap_dir):
+    """No posterior collapse; on a walk it has not seen better than going on as before."""
+    motion_net, _, _ = shipped()
+    r = training.Recording(training.recorded(mocap_dir / "bandai", "validation", "*walk_normal_005*", stitched=False))
+    linear = training.LinearAR(motion_net, r, n=200)
     found = training.one_step(motion_net, linear, r, RNG(0), n=150)
-    assert found["reconstruction"] < 0.7 * found["constant velocity"]
+    assert found["reconstruction"] < 0.8 * found["constant velocity"]
     assert 0.1 < found["kl"] / found["nll"] < 10, "posterior collapse, or a code that says everything"
 
 
