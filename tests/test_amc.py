@@ -704,7 +704,7 @@ def test_skeleton_beside(tmp_path):
     assert mocap.from_amc(path).body == "cmu-somebody-leg85-arm60"
     (tmp_path / "somebody.ASF").unlink()
     assert "there is none" in message(path)
-    assert "gone_01.amc" in (m := message(tmp_path / "gone_01.amc")) and "expected a file" in m
+    assert "gone_01.amc" in (m := message(tmp_path / "gone_01.amc")) and "expected a regular file" in m
     write(tmp_path, "nothing", name="16")
     assert "16.asf, line 1: not an ASF" in message(path)
     cmu_file(tmp_path, [{}])
