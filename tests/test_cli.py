@@ -265,7 +265,9 @@ def test_mocap_inspect(tmp_path):
     assert first == f"{path}: rig bandai, {len(done.stdout.splitlines()) - 2} joints"
     assert re.search(r"\n +LowerLeg_L +shin_l\n", done.stdout)
     assert re.search(
-        r"walk_001 +60.0 Hz +60 frames +1.0 s .* m/s +contact L +\d+ % R +\d+ % .*footfalls +hips 0\.", last
+        r"walk_001 +60.0 Hz +60 frames +1.0 s .* m/s +contact L +\d+ % R +\d+ % .*footfalls +"
+        r"balls \d\.\d cm up in contact +hips 0\.",
+        last,
     )
 
 
