@@ -32,6 +32,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bvh import continuous, listed
+from runs import open_regular
 
 ROOT = "root"
 LIMIT = 1e9  # no length, angle or number of a motion is larger, no unit smaller than its inverse; keeps poses finite
@@ -97,7 +98,7 @@ def _number(word) -> float:
 
 def _text(path, what) -> str:
     """A file's text with comments taken out, lines kept."""
-    with open(path, "rb") as f:
+    with open_regular(path) as f:
         data = f.read()
     if not data.strip():
         _fail(path, f"the file is empty; expected {what}")

@@ -26,11 +26,13 @@ from typing import NoReturn
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from runs import open_regular
+
 CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in "XYZ")
 _CHANNEL = {name.lower(): name for name in CHANNELS}
 _KEYWORDS = {"OFFSET", "CHANNELS", "JOINT", "END", "ROOT", "{", "}"}
 LIMIT = 1e9  # no offset, position or angle of a file is larger; keeps forward kinematics finite
-FRAME_TIMES = (1e-5, 1.0)  # s; keeps speeds finite, and resampling from making much of little
+FRAME_TIMES = (1e-3, 1.0)  # s; no capture is faster, and resampling must not make much of little
 _INDENT_LIMIT = 40  # deeper joints are not indented further, so that what is written of a chain is linear in its size
 
 
@@ -63,11 +65,11 @@ def read(path) -> Bvh:
     Args      path : str or path-like
     Returns   Bvh
     Raises    BvhError: the file is malformed (one line: file, line or joint, and what would have been valid)
-              OSError: the file cannot be opened
+              OSError: the file cannot be opened, or is no regular file
     Test      tests/test_bvh.py::test_real_files_against_scipy, ::test_malformed
     """
     path = os.fspath(path)
-    with open(path, "rb") as f:
+    with open_regular(path) as f:
         data = f.read()
     if not data.strip():
         _fail(path, "the file is empty; expected a BVH, which starts with HIERARCHY")

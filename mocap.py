@@ -237,6 +237,19 @@ def contacts(clip: Clip) -> np.ndarray:
     return np.any((points[..., 2] < CONTACT_HEIGHT) & (speed < CONTACT_SPEED), axis=0)
 
 
+def footfalls(contact, rate, apart=0.1) -> int:
+    """How often a foot begins to touch that was in the air for `apart` seconds: a foot at the limits' edge chatters.
+
+    Args      contact : (T, 2) bool; rate [Hz]
+    Test      tests/test_mocap.py::test_footfalls
+    """
+    n = max(1, round(apart * rate))
+    if len(contact) <= n:
+        return 0
+    before = np.lib.stride_tricks.sliding_window_view(contact[:-1], n, axis=0).any(axis=-1)
+    return int(np.sum(contact[n:] & ~before))
+
+
 # ------------------------------------------------------------------------------------ stitching
 
 _MATCHED = tuple(SEG[s] for s in ("chest", "head", "shin_l", "foot_l", "shin_r", "foot_r", "hand_l", "hand_r"))
@@ -450,7 +463,8 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
         path = Path(motion)
         if not path.exists():
             raise UserError(f"{motion}: no such file or folder; valid: builtin, a .bvh or .amc file, a folder of them")
-        files = sorted(f for f in path.rglob("*") if f.suffix.lower() in (".bvh", ".amc")) if path.is_dir() else [path]
+        found = (f for f in path.rglob("*") if f.suffix.lower() in (".bvh", ".amc") and not f.is_dir())
+        files = sorted(found) if path.is_dir() else [path]
         if not files:
             raise UserError(f"{motion}: a folder without motion; valid: one that holds .bvh or .amc files")
         meant = all(map(is_amc, files)) and split not in ("body", "all")
@@ -508,15 +522,17 @@ def _sequences(single, title, seed=0, limit=0.15, verbose=True):
 
 
 def describe(clip: Clip) -> str:
-    """Rate, length, speed and contacts of a clip in one line.  Test: tests/test_mocap.py::test_inspect."""
+    """Rate, length, speed and contacts of a clip in one line; the balls' mean height while the feet are in contact.
+
+    Test      tests/test_mocap.py::test_inspect"""
     travel = np.linalg.norm(np.diff(clip.pos[:, 0, :2], axis=0), axis=-1).sum()
     speed = travel * clip.rate / max(len(clip) - 1, 1)
     c = contacts(clip)
-    falls = int(np.sum(np.diff(c.astype(int), axis=0) > 0))
+    height = f"{100 * clip.ball[c, 2].mean():.1f}" if c.any() else "-"
     return (
         f"{clip.name:36s} {clip.rate:5.1f} Hz {len(clip):5d} frames {clip.seconds:6.1f} s  "
         f"{travel:6.2f} m  {speed:4.2f} m/s  contact L {100 * c[:, 0].mean():3.0f} % R {100 * c[:, 1].mean():3.0f} %  "
-        f"{falls:3d} footfalls  hips {clip.hip_height:.2f} m"
+        f"{footfalls(c, clip.rate):3d} footfalls  balls {height} cm up in contact  hips {clip.hip_height:.2f} m"
     )
 
 

@@ -38,7 +38,7 @@ from mocap import heading
 from ppo import check_fits, load_policy, sensors_of, trained_as
 from retarget import Reference, forward_kinematics, sole_motion
 from rigs import HELP, Reading
-from runs import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, atomic_write, cli, fmt_count, run_main
+from runs import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, atomic_write, check_folders, cli, fmt_count, run_main
 from stream import AXES, SAMPLE_RATE
 
 
@@ -82,7 +82,9 @@ class Options(character.Switches):
         None, "show it live: window (MuJoCo's viewer) or web (in a browser)", choices=("window", "web")
     )
     port: int = arg(0, "port of the browser viewer, 0 = the first free one from 8080", check=NONNEGATIVE)
-    stream: str | None = arg(None, "drive the character with a headset's .csv file, or - for standard input")
+    stream: str | None = arg(
+        None, "drive the character with a headset's .csv file, a named pipe, or - for standard input"
+    )
     axes: str = arg("unity", "axes of the stream", choices=tuple(AXES))
     grip: float | None = arg(
         None, "how far the fingers point below the controllers' forward axis [degrees]: unity 15, else 90 by default"
@@ -551,7 +553,7 @@ def play_stream(char: Character, policy, path, devices: int, opt: Options) -> No
     Raises    UserError: the stream cannot be read, or shows no headset for a second
     Test      tests/test_stream.py::test_command_line, test_stdin, test_web_view
     """
-    live = opt.stream == "-"
+    live = stream.is_live(opt.stream)
     push = parse_push(opt.push)
     read = 1 if opt.sensors == "hmd" else devices
     player = stream.Player(char, policy.mean_action, force=push.force if push else None, devices=devices)
@@ -559,7 +561,7 @@ def play_stream(char: Character, policy, path, devices: int, opt: Options) -> No
     source = stream.Stream(
         char, opt.axes, sample_rate=opt.sample_rate, grip=opt.grip, user_height=opt.user_height, devices=read
     )  # fmt: skip
-    reader = stream.Reader("standard input" if live else opt.stream, strict=not live, devices=read)
+    reader = stream.Reader("standard input" if opt.stream == "-" else opt.stream, strict=not live, devices=read)
     samples = reader.read(stream.lines_of(opt.stream))
     pace = stream.Pace(player.dt) if opt.realtime or opt.view else None
     if live and pace:
@@ -589,10 +591,7 @@ def play_stream(char: Character, policy, path, devices: int, opt: Options) -> No
         with contextlib.suppress(KeyboardInterrupt):  # the end of a live stream; what happened is still told
             stream.drive(source, samples, player, opt.seconds, pace, see)
     if source.calibration is None:
-        raise UserError(
-            f"{reader.name}: {source.rows} rows show the headset for {source.tracked():.2f} s; "
-            f"calibration needs {stream.CALIBRATION} s"
-        )
+        raise UserError(f"{reader.name}: {source.uncalibrated()}")
     unreadable = [f"{reader.unreadable} lines could not be read"] if reader.unreadable else []
     print(*source.report(), *unreadable, *player.report(), *(pace.report() if pace else []), sep="\n")
     if seen:
@@ -689,9 +688,7 @@ def main(argv=None):
     if opt.stream and opt.measure:
         raise UserError("--measure compares with a human's motion, which a stream has not; give one of the two")
     push = parse_push(opt.push)
-    for out in filter(None, (opt.json, opt.png, opt.video, opt.bvh)):
-        if not Path(out).resolve().parent.is_dir():
-            raise UserError(f"cannot write {out}: there is no folder {Path(out).parent}")
+    check_folders(opt.json, opt.png, opt.video, opt.bvh)
     if opt.json and not (opt.measure or opt.compare):
         raise UserError("--json writes the table of --measure or --compare: give one of them")
     if not opt.compare:

@@ -163,8 +163,8 @@ class Scene:
             found.type, found.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, 1
             found.distance, found.azimuth, found.elevation = 3.5, 135, -15
         else:
-            names = [self.model.camera(i).name for i in range(self.model.ncam)]
-            raise UserError(f"the model has no camera {camera!r}; valid: {', '.join(['track', *names])}")
+            names = dict.fromkeys(["track", *(self.model.camera(i).name for i in range(self.model.ncam))])
+            raise UserError(f"the model has no camera {camera!r}; valid: {', '.join(names)}")
         return found
 
     def _draw(self, marker):

@@ -34,7 +34,7 @@ from mocap import (
     quat_rotate,
 )
 from rigs import HELP, Reading
-from runs import UserError, arg, cli, run_main
+from runs import UserError, arg, check_folders, cli, run_main
 
 STAGE_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 
@@ -464,6 +464,7 @@ def main(argv=None):
     opt = cli(Options, argv, "retarget.py", __doc__)
     if opt.check:
         return report(opt.check)
+    check_folders(opt.bvh, opt.png, opt.video)
     char = opt.load()
     clips = mocap.load(opt.motion, clips=opt.clips, reading=Reading.of(opt))
     print(

@@ -288,7 +288,7 @@ def read(path) -> bvh.Bvh:
     except bvh.BvhError as e:
         raise UserError(str(e)) from None
     except OSError as e:
-        raise UserError(f"{path}: {e.strerror or e}; expected a .bvh file") from None
+        raise UserError(f"{path}: {e.strerror or e}; expected a regular .bvh file") from None
     _check_moving(path, len(b.names), b.values.shape[1])
     return b
 
@@ -339,17 +339,28 @@ def canonical(b: bvh.Bvh, rig: Rig, name: str) -> Clip:
         print(f"{b.path}: the balls of the feet stand at {low:.2f} m: moved to the floor", file=sys.stderr)
         down = np.array([0.0, 0.0, low - BALL_HEIGHT])
         pose = replace(pose, pos=pose.pos - down, ball=pose.ball - down)
-    _check_size(b.path, pose)
+    if (lean := _lean(pose)) > LYING:
+        print(f"{b.path}: the body is {lean:.0f} degrees off {rig.up}, taken as up; another: --up", file=sys.stderr)
+    _check_size(b.path, pose, "; its unit and up axis can be given as --unit, --up")
     return replace(pose, body=_body(name, pose))
+
+
+LYING = 60.0  # degrees; the most that `find_up` takes for upright is 53
+
+
+def _lean(clip) -> float:
+    """Degrees between up and where the head is from the feet, in the mean.  Test: tests/test_rigs.py::test_overrides"""
+    v = (clip.pos[:, SEG["head"]] - clip.pos[:, FEET].mean(axis=1)).mean(axis=0)
+    return float(np.degrees(np.arctan2(np.hypot(v[0], v[1]), v[2])))
 
 
 HIP_HEIGHTS = (0.1, 10.0)  # m; what follows divides by the height of the hips
 
 
-def _check_size(path, clip):
+def _check_size(path, clip, remedy):
     """UserError if nobody is that small or that large."""
     if not HIP_HEIGHTS[0] <= clip.hip_height <= HIP_HEIGHTS[1]:
-        valid = f"{HIP_HEIGHTS[0]:g} to {HIP_HEIGHTS[1]:g} m; a BVH file's unit and axis can be given as --unit, --up"
+        valid = f"{HIP_HEIGHTS[0]:g} to {HIP_HEIGHTS[1]:g} m{remedy}"
         raise UserError(f"{path}: the hips are {clip.hip_height:.3g} m above the floor; valid: {valid}")
 
 
@@ -410,21 +421,8 @@ _WORDS = {  # what joints are called, side and decoration apart; the first that 
 _LEG, _ARM = ("thigh", "shin", "foot", "ball"), ("upper_arm", "forearm", "hand")
 _SIDES = {"l": "l", "left": "l", "r": "r", "right": "r"}
 _DECORATION = {
-    "joint",
-    "jnt",
-    "bone",
-    "bip",
-    "biped",
-    "mixamorig",
-    "def",
-    "org",
-    "character",
-    "rig",
-    "b",
-    "j",
-    "m",
-    "avg",
-}
+    "joint", "jnt", "bone", "bip", "biped", "mixamorig", "def", "org", "character", "rig", "b", "j", "m", "avg",
+}  # fmt: skip
 
 
 def read_name(name: str):
@@ -831,7 +829,7 @@ def from_amc(path, rate=AMC_RATE) -> Clip:
     calibrations = np.stack([rig.calibration(segment) for segment in SEGMENTS])
     pose = amc.global_pose(s, motion)
     clip = level(_human(rig, calibrations, s.names, *pose, Path(path).stem, "", float(rate)))
-    _check_size(path, clip)
+    _check_size(path, clip, f"; the unit is that of {Path(s.path).name}: 1 / (length of :units) inches")
     return replace(clip, body=_body(f"cmu-{Path(s.path).stem}", clip))
 
 
@@ -886,4 +884,4 @@ def read_amc(path):
     except amc.AmcError as e:
         raise UserError(str(e)) from None
     except OSError as e:
-        raise UserError(f"{e.filename or path}: {e.strerror or e}; expected a file") from None
+        raise UserError(f"{e.filename or path}: {e.strerror or e}; expected a regular file") from None

@@ -16,12 +16,14 @@ import contextlib
 import csv
 import dataclasses
 import difflib
+import errno
 import fnmatch
 import io
 import json
 import math
 import os
 import platform
+import stat
 import struct
 import subprocess
 import sys
@@ -236,6 +238,16 @@ def atomic_write(path, content, previous=None):
         raise UserError(f"cannot write {path}: {reason}; give a folder that exists and is writable") from None
 
 
+def check_folders(*paths) -> None:
+    """Before the slow work: the folders of the files to write, None left out.  UserError: one is not there
+
+    Test      tests/test_cli.py::test_folder_to_write
+    """
+    for out in filter(None, paths):
+        if not Path(out).resolve().parent.is_dir():
+            raise UserError(f"cannot write {out}: there is no folder {Path(out).parent}")
+
+
 # ---- files from outside ---------------------------------------------------------------------------------------------
 
 TOML_BYTES, TOML_LINE = 65536, 1000  # tomllib's time and memory grow with the square of the dots in a key
@@ -243,16 +255,40 @@ NESTING = 16  # tables and arrays inside one another: no file of ours has more t
 INTEGER = 60  # digits; a generator's state has 39
 
 
+KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
+
+
+def kind_of(path) -> str | None:
+    """What there is that is no regular file: "a folder", "a pipe", "a device", "a socket"; None for a regular one.
+
+    Raises    OSError: nothing there, or not to be seen; ValueError: a name that none can have
+    Test      tests/test_runs.py::test_regular_files
+    """
+    kind = stat.S_IFMT(os.stat(path).st_mode)
+    return None if kind == stat.S_IFREG else KINDS.get(kind, "a socket")
+
+
+def open_regular(path):
+    """A regular file, open for its bytes.  What else has a name may hang (a pipe) or have no end (/dev/zero).
+
+    Raises    OSError: it cannot be opened, or `strerror` says what it is; ValueError: as `kind_of`
+    Test      tests/test_runs.py::test_regular_files
+    """
+    if kind := kind_of(path):
+        raise OSError(errno.EINVAL, f"is {kind}", os.fspath(path))
+    return open(path, "rb")
+
+
 def read_text(path, expected, limit=None) -> str:
     """A whole text file.
 
     Args      path : file, UTF-8 with or without a byte order mark; expected : what it should be, for the message
               limit : bytes, or None
-    Raises    UserError: cannot be opened, longer than the limit, or another encoding
-    Test      tests/test_runs.py::test_read_text
+    Raises    UserError: no regular file, cannot be opened, longer than the limit, or another encoding
+    Test      tests/test_runs.py::test_read_text, test_regular_files
     """
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             data = file.read(-1 if limit is None else limit + 1)
     except (OSError, ValueError) as error:
         raise UserError(
@@ -526,8 +562,7 @@ def load_checkpoint(path, finite=()):
         arrays = _read_arrays(path)
         meta = parse_json(arrays.pop("__meta__").tobytes())
     except (*UNREADABLE, AttributeError, TypeError) as error:
-        detail = "no __meta__ entry" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
-        raise UserError(f"cannot read checkpoint {path} ({detail}): {expected}") from None
+        raise UserError(f"cannot read checkpoint {path} ({_damage(path, error)}): {expected}") from None
     if not isinstance(meta, dict):
         raise UserError(f"cannot read checkpoint {path} (its __meta__ is no table): {expected}")
     for pattern in finite:
@@ -539,6 +574,17 @@ def load_checkpoint(path, finite=()):
             if arrays[name].dtype.kind in "fc" and not np.isfinite(arrays[name]).all():
                 raise UserError(f"checkpoint {path}: array {name!r} holds NaN or infinity; give an earlier checkpoint")
     return arrays, meta
+
+
+def _damage(path, error) -> str:
+    """What is wrong with a checkpoint, in a user's words."""
+    if isinstance(error, KeyError):
+        return "no __meta__ entry"
+    if isinstance(error, zipfile.BadZipFile):
+        with open(path, "rb") as file:
+            start = file.read(2)
+        return "cut short or damaged" if start == b"PK" else "no .npz" if start else "empty"
+    return f"{type(error).__name__}: {error}"
 
 
 def _read_arrays(path):

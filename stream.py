@@ -26,7 +26,6 @@ import threading
 import time
 from collections import Counter, deque
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -35,7 +34,7 @@ from character import Character, geom_lowest
 from env import BAD, SUBSTEPS, fallen, observation_terms, observe, slices_of
 from mocap import CONTROL_RATE, heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate, quat_slerp
 from retarget import STAGE_VEL, Reference, headset
-from runs import UserError, parse_number
+from runs import UserError, kind_of, parse_number
 
 DEVICES = ("head", "left", "right")
 PARTS = ("px", "py", "pz", "qx", "qy", "qz", "qw")
@@ -44,6 +43,8 @@ SAMPLE_RATE = 90.0  # Hz, of a stream without times
 LINE_LIMIT = 65536  # bytes
 UNREADABLE_LIMIT = 100  # unreadable lines in a row that end a live stream
 EMPTY = ("", "nan", "null", "none")
+STEPS, JUDGED = (0.0005, 0.1), 11  # s between two rows of a headset; steps by whose median a time column is judged
+SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}  # which are not ours
 
 # ------------------------------------------------------------------------------------ reading
 
@@ -76,11 +77,13 @@ class Reader:
     strict : a line that cannot be read is an error (files); otherwise it is skipped and counted (live streams), and
              100 of them in a row are an error.  A file's last line may be cut short: it is skipped
     devices : 3, or 1: the headset's columns alone
-    Test     tests/test_stream.py::test_columns, test_garbage_lines, test_garbage_on_stdin, test_headset_only
+    Test     tests/test_stream.py::test_columns, test_garbage_lines, test_garbage_on_stdin, test_headset_only,
+             test_time_columns
     """
 
     def __init__(self, name: str, strict=True, devices=3):
         self.name, self.strict = name, strict
+        self.steps, self.before = [], None  # of the time column [s]
         self.wanted = COLUMNS[: 1 + devices * len(PARTS)]
         self.line = self.unreadable = self.in_a_row = 0
         self.at = self.names = None
@@ -90,6 +93,8 @@ class Reader:
         for line in lines:
             self.line += 1
             text = line.decode("utf-8", "replace") if isinstance(line, bytes) else line
+            if self.at is None and "\r" in text.strip() and "\0" not in text:
+                raise UserError(f"{self.name}, line {self.line}: line ends of CR alone; valid: LF, or CR and LF")
             if len(text) >= LINE_LIMIT:
                 raise UserError(f"{self.name}, line {self.line}: longer than {LINE_LIMIT} bytes; valid: a CSV's lines")
             cells = text.lstrip("\ufeff").strip()
@@ -110,14 +115,40 @@ class Reader:
                 continue
             self.in_a_row = 0
             devices = values[1:].reshape(3, 7)
+            if len(self.steps) < JUDGED and not fault(devices[0]):
+                self.judge(float(values[0]))
             yield Sample(float(values[0]), devices[:, :3], devices[:, 3:])
         if self.at is None:
             raise UserError(f"{self.name}: is empty; expected a line of column names: {valid_columns()}")
+
+    def judge(self, t):
+        """UserError if the first times cannot be a headset's seconds; rows before it was tracked do not count."""
+        if np.isfinite(t):
+            self.steps += [] if self.before is None else [t - self.before]
+            self.before = t
+        if len(self.steps) < JUDGED:
+            return
+        step = sorted(self.steps)[JUDGED // 2] or sum(self.steps) / JUDGED  # coarse times: most are as the one before
+        if STEPS[0] <= step < 0.999 * STEPS[1]:
+            return
+        named = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "minutes": 60.0, "hours": 3600.0}
+        unit = next((f": {name}?" for name, u in named.items() if 20 <= 1 / max(abs(step) * u, 1e-300) <= 1000), "")
+        valid = f"seconds that increase, {1 / STEPS[1]:.0f} to {1 / STEPS[0]:.0f} rows in each"
+        what = f"time steps of {step:.3g} s{unit}"
+        if step <= 0:
+            what = f"time runs backwards, by {-step:.3g} s a row" if step else "time stands still"
+            valid += ", or no column time (then --sample-rate says how many)"
+        raise UserError(f"{self.name}, line {self.line}, column {self.names[self.at[0]]}: {what}; valid: {valid}")
 
     def header(self, line):
         """The first line: where which column is."""
         self.names = [c.strip() for c in line.split(",")]
         known = [column(c) for c in self.names]
+        ours = lambda mark: sum(c is not None for c in map(column, line.split(mark)))  # noqa: E731
+        mark = max(SEPARATORS, key=ours)
+        if ours(mark) > max(ours(","), 1):
+            valid = "commas, and points in the numbers"
+            raise UserError(f"{self.name}, line {self.line}: {SEPARATORS[mark]} between the columns; valid: {valid}")
         missing = [c for c in self.wanted[1:] if c not in known]
         twice = [c for c, k in Counter(known).items() if c and k > 1]
         if twice:
@@ -136,7 +167,9 @@ class Reader:
         cells = line.split(",")
         if len(cells) != len(self.names):
             column = self.names[min(len(cells), len(self.names)) - 1]
-            raise ValueError(f"column {column}: {len(cells)} cells; valid: {len(self.names)}, as in the first line")
+            comma = " (commas in the numbers? valid: points)" if len(cells) > len(self.names) else ""
+            valid = f"{len(self.names)}, as in the first line{comma}"
+            raise ValueError(f"column {column}: {len(cells)} cells; valid: {valid}")
         out = np.full(len(COLUMNS), np.nan)
         for k, i in enumerate(self.at):
             cell = cells[i].strip().strip('"') if i >= 0 else ""
@@ -153,18 +186,38 @@ def valid_columns() -> str:
     return "time (optional) and DEVICE_px, _py, _pz, _qx, _qy, _qz, _qw for DEVICE head, left, right"
 
 
-def lines_of(path):
-    """The lines of a file, or of standard input for "-", as they come, none longer than LINE_LIMIT.
+def is_live(path) -> bool:
+    """Whether "-" or a named pipe, to be read as the lines come, or a file.
 
-    Raises    UserError: no such file
-    Test      tests/test_stream.py::test_columns, test_stdin"""
+    Raises    UserError: nothing there, a folder, a device
+    Test      tests/test_stream.py::test_pipes"""
+    if str(path) == "-":
+        return True
+    valid = "a .csv file, a named pipe, or - for standard input"
+    try:
+        kind = kind_of(path)
+    except (OSError, ValueError) as error:
+        why = "no such file" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", None) or error
+        raise UserError(f"--stream {path}: {why}; valid: {valid}") from None
+    if kind not in (None, "a pipe"):
+        raise UserError(f"--stream {path}: is {kind}; valid: {valid}")
+    return kind is not None
+
+
+def lines_of(path):
+    """The lines of a file or a pipe, or of standard input for "-", as they come, none longer than LINE_LIMIT.
+
+    Raises    UserError: as `is_live`, or it cannot be read
+    Test      tests/test_stream.py::test_columns, test_stdin, test_pipes"""
     if str(path) == "-":
         yield from iter(lambda: sys.stdin.buffer.readline(LINE_LIMIT), b"")
         return
-    if not Path(path).is_file():
-        raise UserError(f"--stream {path}: no such file; valid: a .csv file, or - for standard input")
-    with open(path, "rb") as file:
-        yield from iter(lambda: file.readline(LINE_LIMIT), b"")
+    is_live(path)
+    try:
+        with open(path, "rb") as file:
+            yield from iter(lambda: file.readline(LINE_LIMIT), b"")
+    except OSError as error:
+        raise UserError(f"--stream {path}: {error.strerror or error}; valid: a file that can be read") from None
 
 
 def arriving(items, silence: float, period: float):
@@ -359,6 +412,7 @@ class Guard:
         self.tracks = [Track() for _ in DEVICES]
         self.yaw, self.shift = 0.0, np.zeros(3)  # the anchor: p' = R_z(yaw) p + shift
         self.events, self.seconds = Counter(), Counter()  # (device, what) -> how often, how long
+        self.heads = Counter()  # what the headset's rows were: a fault, or None -> how many
 
     def push(self, sample: Sample, why=None) -> list[Sample]:
         """The poses to use, in order: several after a drop-out, none before the headset is seen.
@@ -398,6 +452,7 @@ class Guard:
         for i, track in enumerate(self.tracks):
             if not faults[i] and t - track.changed > FROZEN and newest > track.changed:
                 faults[i] = "frozen"
+        self.heads[faults[0]] += why is None
         lost = np.array([bool(f) for f in faults])
         rows = np.where(lost[:, None], [0.0, 0, 0, 1, 0, 0, 0], rows)
         quat = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
@@ -611,6 +666,17 @@ class Stream:
     def tracked(self) -> float:
         """Seconds of headset seen while calibrating."""
         return self.seen[-1][0] - self.seen[0][0] if self.seen else 0.0
+
+    def uncalibrated(self) -> str:
+        """Why there is no calibration, for a complaint.  Test: tests/test_stream.py::test_no_calibration"""
+        need = f"calibration needs {CALIBRATION} s"
+        if not self.rows:
+            return f"no rows after the columns' names; {need}"
+        hint = {"far away": ": centimetres? valid: metres", "no rotation": ": valid: quaternions of length 1"}
+        bad = [f"{n} {what}{hint.get(what, '')}" for what, n in self.guard.heads.most_common() if what and n]
+        bad += [f"{self.clock.dropped} before their predecessor"] if self.clock.dropped else []
+        why = f"; of them {', '.join(bad)}" if bad else ""
+        return f"{self.rows} rows show the headset for {self.tracked():.2f} s; {need}{why}"
 
     def report(self) -> list[str]:
         """What was calibrated and what went wrong, for a reader.  Test: tests/test_stream.py::test_real_recordings"""

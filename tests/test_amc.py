@@ -3,6 +3,7 @@
 Tests on recorded motion find it through the environment variable MOCAP_DIR; without it they are skipped.
 """
 
+import re
 import time
 from dataclasses import replace
 
@@ -701,10 +702,15 @@ def test_skeleton_beside(tmp_path):
     m = message(path)
     assert "looked for 16.asf or a single .asf" in m and "07.asf, somebody.ASF" in m and "16_01.amc" in m
     (tmp_path / "07.asf").unlink()
+    (tmp_path / "somebody.ASF").write_text(re.sub(r"(:units\s.*?length )\S+", r"\g<1>4500", cmu_asf(), flags=re.S))
+    m = message(path)  # a ten thousandth of its size; what a BVH's flags say is no help
+    assert "above the floor; valid: 0.1 to 10 m; the unit is that of somebody.ASF: 1 / (length of :units)" in m
+    assert "--unit" not in m
+    (tmp_path / "somebody.ASF").write_text(cmu_asf())
     assert mocap.from_amc(path).body == "cmu-somebody-leg85-arm60"
     (tmp_path / "somebody.ASF").unlink()
     assert "there is none" in message(path)
-    assert "gone_01.amc" in (m := message(tmp_path / "gone_01.amc")) and "expected a file" in m
+    assert "gone_01.amc" in (m := message(tmp_path / "gone_01.amc")) and "expected a regular file" in m
     write(tmp_path, "nothing", name="16")
     assert "16.asf, line 1: not an ASF" in message(path)
     cmu_file(tmp_path, [{}])

@@ -416,6 +416,7 @@ MALFORMED = {  # name: (text, what the message must say)
     "no frame time": (swap("Frame Time: 0.04\n", ""), "no 'Frame Time: SECONDS'"),
     "frame time empty": (SMALL[: SMALL.index(" 0.04")], "Frame Time: ''; expected a positive number"),
     "frame time zero": (swap("0.04", "0.0"), "line 18: Frame Time: '0.0'; expected a positive number of seconds"),
+    "frame time tiny": (swap("0.04", "0.00001"), "'0.00001'; expected a positive number of seconds, 0.001 to 1"),
     "frame time negative": (swap("0.04", "-0.04"), "'-0.04'"),
     "frame time nan": (swap("0.04", "nan"), "'nan'"),
     "frame time inf": (swap("0.04", "inf"), "'inf'"),

@@ -172,6 +172,42 @@ def test_broken_motion(script, here, capsys):
     assert "one that holds .bvh or .amc files" in check(here / "empty")
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+@pytest.mark.parametrize("what", ["f.bvh", ".", "07_01.amc", "map.toml", "/dev/zero"])
+def test_pipes_and_devices(what, here, capsys):
+    """None is waited for or read without end: one line says what it is."""
+    write_rig(here / "w.bvh", walk(0.5), "mixamo")
+    names = {"07_01.amc": "07.asf", "map.toml": "map.toml"}
+    if what != "/dev/zero":
+        os.mkfifo(here / names.get(what, "f.bvh"))
+    if what == "07_01.amc":
+        (here / what).write_text("1\nroot 0 0 0 0 0 0\n")
+    args = ["w.bvh", "--joint-map", what] if what == "map.toml" else [what]
+    old = signal.signal(signal.SIGALRM, lambda *_: pytest.fail("it waits"))
+    signal.alarm(20)
+    try:
+        assert run("mocap", "inspect", *args) == 2
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, old)
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    kind = "device" if what == "/dev/zero" else "pipe"
+    assert re.search(rf"{names.get(what, 'f.bvh' if what == '.' else what)}: is a {kind}; expected ", err), err
+
+
+def test_folder_to_write(here, capsys):
+    """Said before the slow work: no motion is read."""
+    for script, flags in (
+        ("retarget", ("--bvh", "--png", "--video")),
+        ("play", ("--bvh", "--png", "--video", "--json")),
+    ):
+        more = ["--measure", "--policy", "none.npz"] if script == "play" else []
+        for flag in flags:
+            err = refuse(capsys, here, script, *more, "--motion", "none", flag, here / "no" / "x.bvh")
+            assert f"cannot write {here / 'no' / 'x.bvh'}: there is no folder {here / 'no'}" in err
+
+
 @pytest.mark.parametrize("script", RUNS)
 def test_no_clip_matches(script, here, capsys):
     more = ["--measure", "--policy", small_policy(here / "p.npz")] if script == "play" else []
@@ -229,7 +265,9 @@ def test_mocap_inspect(tmp_path):
     assert first == f"{path}: rig bandai, {len(done.stdout.splitlines()) - 2} joints"
     assert re.search(r"\n +LowerLeg_L +shin_l\n", done.stdout)
     assert re.search(
-        r"walk_001 +60.0 Hz +60 frames +1.0 s .* m/s +contact L +\d+ % R +\d+ % .*footfalls +hips 0\.", last
+        r"walk_001 +60.0 Hz +60 frames +1.0 s .* m/s +contact L +\d+ % R +\d+ % .*footfalls +"
+        r"balls \d\.\d cm up in contact +hips 0\.",
+        last,
     )
 
 

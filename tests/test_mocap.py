@@ -712,6 +712,7 @@ def test_load_errors(tmp_path, quick_builtin):
     m = message("builtin", clips="*jog*", split="validation")
     assert "'*jog*'" in m and "'validation'" in m and "train" in m
     write_as(tmp_path / "walk_001.bvh", "bandai", still(2))
+    (tmp_path / "a.bvh").mkdir()  # a folder is searched, whatever its name
     (tmp_path / "UPPER.BVH").write_text((tmp_path / "walk_001.bvh").read_text())  # other systems' spelling
     assert [c.name for c in mocap.load(tmp_path)] == ["UPPER", "walk_001"]
     m = message(tmp_path, clips="run*")
@@ -719,7 +720,7 @@ def test_load_errors(tmp_path, quick_builtin):
     text = (tmp_path / "walk_001.bvh").read_text().splitlines()
     (tmp_path / "broken_002.bvh").write_text("\n".join([*text[:-1], text[-1].replace("0.", "nan ", 1)]))
     assert "broken_002.bvh" in message(tmp_path)
-    with pytest.raises(UserError, match="gone.bvh.*expected a .bvh file"):
+    with pytest.raises(UserError, match="gone.bvh.*expected a regular .bvh file"):
         mocap.from_bvh(tmp_path / "gone.bvh")
 
 
@@ -764,11 +765,40 @@ def test_inspect(tmp_path, capsys):
     travel = sum(np.hypot(*(b - a)) for a, b in zip(clip.pos[:, 0, :2], clip.pos[1:, 0, :2]))
     assert f"{travel:6.2f} m" in out and f"{travel / (59 / 60):4.2f} m/s" in out
     assert f"contact L {100 * mocap.contacts(clip)[:, 0].mean():3.0f} %" in out
+    low = [z for t, c in zip(clip.ball, mocap.contacts(clip)) for z, on in zip(t[:, 2], c) if on]
+    assert f"balls {100 * sum(low) / len(low):.1f} cm up in contact" in out
+    assert " 0 footfalls  balls - cm up" in mocap.describe(mocap.replace(clip, pos=clip.pos + 1, ball=clip.ball + 1))
     mocap.main(["inspect", str(tmp_path)])
     out = capsys.readouterr().out
     assert "walk_001" in out and " 30.0 Hz" in out and "single clips are used" in out
     with pytest.raises(UserError, match="nowhere"):
         mocap.main(["inspect", str(tmp_path / "nowhere")])
+
+
+def test_footfalls():
+    """Steps that a slow loop counts, whatever the rate; a label that flickers within a tenth of a second adds none."""
+    clip = walk(8.0, 30.0)
+    counts = []
+    for rate in (30.0, 120.0):
+        contact = mocap.contacts(mocap.resample(clip, rate))
+        slow, n = 0, round(0.1 * rate)
+        for foot in contact.T:
+            for k in range(n, len(foot)):
+                slow += foot[k] and not any(foot[k - n : k])
+        assert mocap.footfalls(contact, rate) == slow
+        counts.append(slow)
+        noisy, rng = contact.copy(), np.random.default_rng(0)
+        for k in rng.permutation(np.flatnonzero(contact[n:-n].all(axis=1)))[:20] + n:
+            noisy[k] = False
+        assert (noisy != contact).any() and mocap.footfalls(noisy, rate) == slow
+    assert counts[0] == counts[1] and 10 <= slow <= 20
+    assert mocap.footfalls(contact[:3], 120.0) == mocap.footfalls(contact[:0], 30.0) == 0
+
+
+def test_cmu_footfalls(mocap_dir):
+    """A walker of 1.2 m/s takes about two steps a second: by the labels' edges alone there would be 23 in 3.1 s."""
+    clip = mocap.from_amc(mocap_dir / "cmu" / "35" / "35_12.amc")
+    assert 5 <= mocap.footfalls(mocap.contacts(clip), clip.rate) <= 7
 
 
 @pytest.mark.parametrize("frames", [1, 2])

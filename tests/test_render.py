@@ -119,6 +119,9 @@ def test_scenes_side_by_side_and_large():
     assert model.vis.global_.offwidth == 640  # the caller's model is as it was
     with pytest.raises(UserError, match="'side'; valid: track, front"):
         render.Scene(model, camera="side")
+    own = mujoco.MjModel.from_xml_string(XML.replace('name="front"', 'name="track"'))  # our name, too, for its own
+    with pytest.raises(UserError, match="'side'; valid: track$"):
+        render.Scene(own, camera="side")
     small.close(), large.close(), fast.close()
 
 

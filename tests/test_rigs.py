@@ -1,5 +1,6 @@
 """rigs.py: one walk written as files of many rigs, with joint frames turned at random, comes back as the same human."""
 
+import contextlib
 import re
 from dataclasses import replace
 
@@ -369,6 +370,13 @@ def test_overrides(tmp_path, capsys):
     known = write_as(tmp_path / "b.bvh", "lafan1", clip)
     half = mocap.from_bvh(known, Reading(unit="0.005"))
     np.testing.assert_allclose(half.pos, 0.5 * clip.pos, atol=1e-6)
+    capsys.readouterr()
+    for path, up, lean in ((known, "z", "[89]"), (known, "-y", 17), (tmp_path / "a.bvh", "x", "[89]")):  # it lies
+        with contextlib.suppress(UserError):
+            mocap.from_bvh(path, Reading(up=up))
+        assert re.search(rf"the body is {lean}\d degrees off {up}, taken as up; another: --up", capsys.readouterr().err)
+    mocap.from_bvh(known, Reading(up="y"))
+    assert capsys.readouterr().err == ""
     for bad in (dict(unit="ell"), dict(unit="nan"), dict(unit="0"), dict(up="north")):
         with pytest.raises(UserError, match="valid: "):
             Reading(**bad)

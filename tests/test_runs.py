@@ -127,6 +127,27 @@ def test_read_text(tmp_path):
             runs.read_text(odd, "a text")
 
 
+def test_regular_files(tmp_path):
+    """A pipe is not waited for, a device not read without end; a name that cannot be is an OSError or a ValueError."""
+    kinds = {"folder": "a folder"} | ({"pipe": "a pipe"} if hasattr(os, "mkfifo") else {})
+    (tmp_path / "folder").mkdir()
+    if "pipe" in kinds:
+        os.mkfifo(tmp_path / "pipe")
+    paths = {tmp_path / name: kind for name, kind in kinds.items()}
+    paths |= {Path("/dev/zero"): "a device"} if Path("/dev/zero").exists() else {}
+    for path, kind in paths.items():
+        assert runs.kind_of(path) == kind
+        with pytest.raises(OSError, match=f"is {kind}"):
+            runs.open_regular(path)
+        with pytest.raises(UserError, match=f"cannot read {path}: is {kind}; expected a text"):
+            runs.read_text(path, "a text")
+    (tmp_path / "file").write_text("x")
+    assert runs.kind_of(tmp_path / "file") is None and runs.open_regular(str(tmp_path / "file")).read() == b"x"
+    for odd in (tmp_path / "none", "nul\0"):
+        with pytest.raises((OSError, ValueError)):
+            runs.open_regular(odd)
+
+
 def test_read_toml(tmp_path):
     path = tmp_path / "a.toml"
     path.write_text("[a]\nb = {c = [1, 2.5]}\n")
@@ -294,7 +315,8 @@ def test_damaged_checkpoints(tmp_path, kind):
     path = tmp_path / "x.npz"
     runs.save_checkpoint(path, ARRAYS, {})
     damage(path, kind)
-    with pytest.raises(UserError, match="x.npz.*save_checkpoint"):
+    said = {"empty": r"\(empty\)", "cut": r"\(cut short or damaged\)", "text": r"\(no .npz\)"}.get(kind, "")
+    with pytest.raises(UserError, match=f"x.npz.*{said}.*save_checkpoint"):
         runs.load_checkpoint(path)
 
 

@@ -2,7 +2,9 @@
 
 import io
 import os
+import re
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -119,6 +121,13 @@ def test_columns(tmp_path):
         ",".join([*stream.COLUMNS, "left_px"]): "column left_px is there twice",
         "": "is empty",
         "a" * 70000: "longer than 65536 bytes",
+        **{
+            mark.join(stream.COLUMNS): f"f.csv, line 1: {name} between the columns; valid: commas, and points"
+            for mark, name in stream.SEPARATORS.items()
+        },
+        ",".join(stream.COLUMNS) + "\n" + ",".join(["0,5"] * 22) + "\n": r"column right_qw: 44 cells.*valid: points\)",
+        ",".join(stream.COLUMNS) + "\r" + "0," * 30 + "\r": "line 1: line ends of CR alone; valid: LF",
+        ",".join(stream.COLUMNS) + "\r" + "0," * 40000: "line 1: line ends of CR alone; valid: LF",
     }
     for text, message in cases.items():
         (tmp_path / "f.csv").write_text(text)
@@ -126,6 +135,9 @@ def test_columns(tmp_path):
             list(Reader("f.csv").read(stream.lines_of(tmp_path / "f.csv")))
     with pytest.raises(UserError, match="no such file; valid"):
         list(stream.lines_of(tmp_path / "none.csv"))
+    (tmp_path / "d.csv").mkdir()
+    with pytest.raises(UserError, match="d.csv: is a folder; valid: a .csv file, a named pipe, or -"):
+        list(stream.lines_of(tmp_path / "d.csv"))
     assert "head, left, right" in stream.valid_columns()
 
 
@@ -152,6 +164,75 @@ def test_garbage_on_stdin():
     assert reader.unreadable == 2
     with pytest.raises(UserError, match="line 101, column"):
         list(Reader("standard input", strict=False).read([good[0], *["x\n"] * 200]))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_pipes(tmp_path, monkeypatch):
+    """A named pipe is a live source, read as the lines come; a device is none; permission denied is one line."""
+    pipe, lines = tmp_path / "live", lines_in_our_axes(1.5)
+    os.mkfifo(pipe)
+    assert stream.is_live(pipe) and stream.is_live("-") and not stream.is_live(__file__)
+
+    def write():
+        with open(pipe, "w") as file:
+            file.write("".join(lines) + lines[1][:30])  # a program that dies in the middle of a line
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    reader = Reader("live", strict=False)
+    assert len(list(reader.read(stream.lines_of(pipe)))) == len(lines) - 1 and reader.unreadable == 1
+    writer.join(10)
+    with pytest.raises(UserError, match="/dev/zero: is a device; valid: a .csv file"):
+        stream.is_live("/dev/zero")
+
+    def denied(path, *_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("builtins.open", denied)
+    (good, _), bad = os.path.split(__file__), UserError
+    with pytest.raises(bad, match=f"--stream {good}.*: Permission denied; valid: a file that can be read"):
+        list(stream.lines_of(__file__))
+
+
+def timed(times, seconds=3.0):
+    """A file of a standing user with another time column."""
+    lines = lines_in_our_axes(seconds)
+    rows = [line.split(",", 1)[1] for line in lines[1:]]
+    return [lines[0], *(f"{t:.15g},{row}" for t, row in zip(times, rows))]
+
+
+TIMES = {  # name: (seconds of the k-th row, what is said of it)
+    "milliseconds": (lambda k: 1000 * k / 90, r"time steps of 11.1 s: milliseconds\?; valid: seconds"),
+    "microseconds": (lambda k: 1e6 * k / 90, r"time steps of 1.11e\+04 s: microseconds\?; valid: seconds"),
+    "3.3": (lambda k: 3.3 * k, r"time steps of 3.3 s: milliseconds\?; valid: seconds that increase, 10 to 2000 rows"),
+    "tenths": (lambda k: 0.1 * k, r"time steps of 0.1 s; valid: seconds"),
+    "minutes": (lambda k: k / 5400, r"time steps of 0.000185 s: minutes\?; valid"),
+    "constant": (lambda k: 7.0, r"time stands still; valid: seconds that increase, .* or no column time"),
+    "backwards": (lambda k: -k / 90, r"time runs backwards, by 0.0111 s a row; valid: seconds that increase"),
+}
+
+
+@pytest.mark.parametrize("kind", TIMES)
+def test_time_columns(jesse, kind):
+    """Other units, a clock that stands or runs backwards: said by the 12th tracked row, before the character moves."""
+    times, words = TIMES[kind]
+    lines = timed([times(k) for k in range(200)])
+    lost = lines[1].split(",", 1)[0] + "," + ",".join(["0"] * 21) + "\n"
+    source, ticks = Stream(jesse, "mujoco"), []
+    with pytest.raises(UserError, match=rf"f.csv, line 16, column time: {words}"):
+        for sample in Reader("f.csv").read([lines[0], lost, lost, lost, *lines[1:]]):
+            ticks += source.push(sample)
+    assert not ticks and source.rows == 14
+
+
+@pytest.mark.parametrize(
+    "times",
+    [lambda k: k // 3 / 30, lambda k: np.floor(k / 9) / 10, lambda k: k / 1000, lambda k: 1e9 + k / 11,
+     lambda k: k / 90 - (k % 50 == 0), lambda k: k / 90 + 4 * (k // 15)],
+)  # fmt: skip
+def test_good_time_columns(times):
+    """Coarse clocks, fast and slow devices, late rows and drop-outs are left to the Clock and the Guard."""
+    assert len(list(Reader("f.csv").read(timed([times(k) for k in range(200)])))) == 200
 
 
 # ------------------------------------------------------------------------------------ axes
@@ -399,6 +480,29 @@ def test_calibration(jesse):
         assert np.allclose(ahead[:2], [1, 0], atol=1e-9)  # travel is not scaled
     told = stream.calibrate(jesse, pos, np.tile(turn, (100, 1)), user_height=1.7)
     assert told.height == 1.7 and told.floor == pytest.approx(2.3 - 1.7, abs=0.01)
+
+
+NO_CALIBRATION = {  # name: (row of the headset, of a good one; what is said of 200 such rows)
+    "zero": (lambda row: 0 * row, "200 rows show the headset for 0.00 s; .*; of them 200 all zero"),
+    "inf": (lambda row: row + np.inf, "of them 200 not finite"),
+    "1e308": (lambda row: row * 0 + 1e308, "of them 200 far away: centimetres"),
+    "centimetres": (lambda row: row * [100, 100, 100, 1, 1, 1, 1], "of them 200 far away: centimetres. valid: metres"),
+    "matrices": (lambda row: row * [1, 1, 1, 3, 3, 3, 3], "of them 200 no rotation: valid: quaternions of length 1"),
+    "one row": (None, r"1 rows show the headset for 0.00 s; calibration needs 1.0 s$"),
+    "none": (None, "no rows after the columns' names; calibration needs 1.0 s$"),
+}
+
+
+@pytest.mark.parametrize("kind", NO_CALIBRATION)
+def test_no_calibration(jesse, kind):
+    """What the rows were, where a second of headset is not among them."""
+    change, words = NO_CALIBRATION[kind]
+    source = Stream(jesse, "mujoco")
+    for s in standing(200 / 90)[: {"one row": 1, "none": 0}.get(kind, 200)]:
+        rows = np.concatenate([s.pos, XYZW(s.quat)], axis=1)
+        rows[0] = rows[0] if change is None else change(rows[0])
+        assert source.push(Sample(s.t, rows[:, :3], rows[:, 3:])) == []
+    assert source.calibration is None and re.search(words, source.uncalibrated()), source.uncalibrated()
 
 
 @pytest.mark.parametrize("axes", stream.AXES)
