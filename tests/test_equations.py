@@ -35,6 +35,9 @@ REQUIRED = (
         "head_wobble_deg_s", "torque_rms", "saturation",
     )),
     *(f"DROP Eq. {k}" for k in range(1, 17)),
+    *(f"SAN-{k}" for k in range(1, 9)),
+    *(f"SAN §{s}" for s in ("4.1", "4.2 static branch", "4.3 unpooling", "3 primal skeleton", "4.4", "5.2 networks")),
+    *("SAN §5 training", "SAN §5.2 clean-up", "SAN metric"),
     *("DROP Algorithm 1", "DROP §7 rotations", "DROP §8.1", "DROP §8.2", "DROP §8.3", "DROP §8.4", "DROP §8.5"),
 )  # fmt: skip
 # Missing, or experiments: these need no code and no test.
