@@ -326,7 +326,7 @@ def rec_loss(y, x, world, world_true, position):
     Args      y, x : (C, T, B) decoded and given features, standardised; world, world_true : (J, 3, T, B) [legs]
               position : weight of the second part
     Returns   loss; d y; d world
-    Test      tests/test_skeletal.py::test_losses, test_whole_loss_gradient
+    Test      tests/test_skeletal.py::test_losses, test_skeletal_train.py::test_whole_loss_gradient
     """
     a, dy = mse(y, x)
     b, dworld = mse(world, world_true)
@@ -337,7 +337,7 @@ def ltc_loss(z_fake, z):
     r"""Latent consistency  [SAN-5]: |E_Q^B(S_B, Q~_B) - E_Q^A(S_A, Q_A)|_1, as a mean.
 
     Returns   loss; d z_fake; d z
-    Test      tests/test_skeletal.py::test_losses, test_whole_loss_gradient
+    Test      tests/test_skeletal.py::test_losses, test_skeletal_train.py::test_whole_loss_gradient
     """
     d = z_fake - z
     sign = np.sign(d) / d.size
@@ -360,7 +360,7 @@ def ee_loss(world_a, world_b, ends_a, ends_b, reach_a, reach_b):
               whole height, see Choices.ee_height)
     Args      world : (J, 3, T, B); ends : end effectors in the same order
     Returns   loss; d world_b (A is data)
-    Test      tests/test_skeletal.py::test_losses, test_whole_loss_gradient
+    Test      tests/test_skeletal.py::test_losses, test_skeletal_train.py::test_whole_loss_gradient
     """
     va = np.diff(world_a[ends_a], axis=2) / reach_a[:, None, None]
     vb = np.diff(world_b[ends_b], axis=2) / reach_b[:, None, None]

@@ -127,7 +127,7 @@ def families(opt) -> tuple:
     """Two families of characters from one set of motions  [GAP]: unpaired, every clip is on one character only.
 
     The first character of the first structure is the recorded actor.  -> two Domains
-    Test      tests/test_skeletal_train.py::test_families_are_unpaired
+    Test      tests/test_skeletal_play.py::test_families_are_unpaired
     """
     structure, motions = base_motions(opt, "train", opt.limit)
     rng = np.random.default_rng([opt.seed, 11])
@@ -173,7 +173,7 @@ def own_folders(opt) -> tuple:
     """Two folders of BVH files of two rigs, each file's proportions a character.  -> two Domains
 
     Raises    UserError: no common primal skeleton
-    Test      tests/test_skeletal_train.py::test_own_folders
+    Test      tests/test_skeletal_play.py::test_own_folders
     """
     patterns, domains, first = tuple(p for p in opt.drop.split(",") if p), [], None
     for path in (opt.a, opt.b):
@@ -398,7 +398,7 @@ def domain_meta(domains) -> list:
 def prepared(opt) -> tuple:
     """The two Domains of `families` or `own_folders`; from the file --data where it is there.
 
-    Test: tests/test_skeletal_train.py::test_train_command"""
+    Test: tests/test_skeletal_play.py::test_train_command"""
     if opt.data and Path(opt.data).exists():
         arrays, meta = load_checkpoint(opt.data)
         return domains_from(arrays, meta, opt.data)
@@ -439,7 +439,7 @@ def domains_from(arrays, meta, path) -> tuple:
 
 
 def train(argv) -> int:
-    """python skeletal.py train.  Test: tests/test_skeletal_train.py::test_train_command"""
+    """python skeletal.py train.  Test: tests/test_skeletal_play.py::test_train_command"""
     opt = cli(TrainOptions, argv, "skeletal.py train", TrainOptions.__doc__)
     out = Path(opt.out or "runs/skeletal")
     check_run(out, opt.resume)
