@@ -231,7 +231,7 @@ class TrainOptions:
     resume: bool = arg(False, "continue the run in --out")
     steps: int = arg(20000, "optimiser steps", check=COUNT)
     batch: int = arg(16, "windows a structure and step; the paper's is 256", check=COUNT)
-    lr: float = arg(5e-4, "Adam's learning rate; the paper's is 2e-4", check=POSITIVE)
+    lr: float = arg(5e-4, "Adam's learning rate, falling to a tenth at --steps; the paper's is 2e-4", check=POSITIVE)
     intra: float = arg(0.3, "share of the steps that retarget within the structure", check=NONNEGATIVE)
     variant: str = arg("ours", "errata: ours, as printed, or the published code's numbers", choices=tuple(CHOICES))
     pool: str = arg("mean", "skeletal pooling", choices=("mean", "max"))
@@ -470,6 +470,8 @@ def train(argv) -> int:
     last, sums, count = time.monotonic(), {}, 0
     try:
         while trainer.step_count < opt.steps:
+            for adam in trainer.adams:
+                adam.lr = opt.lr * (1.0 - 0.9 * trainer.step_count / opt.steps)
             for k, v in trainer.step().items():
                 sums[k] = sums.get(k, 0.0) + v
             count += 1
