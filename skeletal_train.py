@@ -229,6 +229,7 @@ class TrainOptions:
     characters: int = arg(4, "characters a family", check=COUNT)
     out: str | None = arg(None, "run folder; default runs/skeletal")
     resume: bool = arg(False, "continue the run in --out")
+    ship: str | None = arg(None, "only write the generators of the run in --out to this .npz, with the data's licence")
     steps: int = arg(20000, "optimiser steps", check=COUNT)
     batch: int = arg(16, "windows a structure and step; the paper's is 256", check=COUNT)
     lr: float = arg(5e-4, "Adam's learning rate, falling to a tenth at --steps; the paper's is 2e-4", check=POSITIVE)
@@ -442,6 +443,10 @@ def train(argv) -> int:
     """python skeletal.py train.  Test: tests/test_skeletal_play.py::test_train_command"""
     opt = cli(TrainOptions, argv, "skeletal.py train", TrainOptions.__doc__)
     out = Path(opt.out or "runs/skeletal")
+    if opt.ship:
+        meta = ship(out, opt.ship)
+        print(f"{opt.ship}: {meta['steps']} steps; {meta['licence']}")
+        return 0
     check_run(out, opt.resume)
     if (opt.a is None) != (opt.b is None):
         raise UserError("--a and --b go together: two folders of two rigs; or give --motion alone")

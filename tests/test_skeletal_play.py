@@ -70,7 +70,7 @@ def test_train_command(trained, capsys, tmp_path):
 
 def test_ship_and_load(trained, tmp_path):
     """Generators, characters, statistics and the licence; no optimiser, no critic; the same answers."""
-    st.ship(trained / "run", tmp_path / "s.npz")
+    assert run("train", "--out", trained / "run", "--ship", tmp_path / "s.npz") == 0
     arrays, meta = load_checkpoint(tmp_path / "s.npz")
     assert meta["licence"] == "MIT" and not any(k.startswith(("adam", "critic", "pool")) for k in arrays)
     a, b = play.Retargeter(trained / "run"), play.Retargeter(tmp_path / "s.npz")
