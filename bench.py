@@ -247,7 +247,7 @@ class SkeletalStep:
         z, encoded = net.encode_forward(self.x, features)
         y, decoded = net.decode_forward(z, features)
         _, world, kin = skeletal.fk_forward(y, self.offsets, SKELETON, self.turn)
-        loss, dy, dworld = skeletal_net.rec_loss(y, self.x, world, self.true, 1.0)
+        loss, dy, dworld = skeletal_net.rec_loss(y, self.x, world, self.true, 1.0, 1.0)
         net.grad[:] = 0.0
         dz, df2 = net.decode_backward(dy + skeletal.fk_backward(None, dworld, kin), decoded)
         _, df1 = net.encode_backward(dz, encoded, want_dx=False)
@@ -323,7 +323,8 @@ def torch_step(ours: SkeletalStep, torch):
         z = leaky(grouped(conv(net.e[1], z, f1[..., 0]), pools[1]))
         y = leaky(conv(net.d[0], opened(up(z), pools[1]), opened(f2, pools[1])[..., 0]))
         y = conv(net.d[1], opened(up(y), pools[0]), s)
-        loss = F.mse_loss(y, x) + F.mse_loss(kinematics(y), true)
+        p = kinematics(y)
+        loss = F.mse_loss(y, x) + F.mse_loss(p - p[:, :1], true - true[:, :1]) + F.mse_loss(p[:, 0], true[:, 0])
         adam.zero_grad()
         loss.backward()
         adam.step()

@@ -44,6 +44,7 @@ class Choices:
                      multiplies them out: 5, 2.5, 1, 50, with another factor of 100 inside its L_ee.  That one is a mean
                      over five ends and three axes where [SAN-7] prints a sum: 5000 / 15 = 333.  Ours: 300
     position       : weight of the position part of L_rec against the rotation part, in leg lengths squared (ASSUMED)
+    path           : the same of the root's path (ASSUMED)
     """
 
     neighbour_mean: bool = False
@@ -52,6 +53,7 @@ class Choices:
     ee_height: bool = False
     weights: tuple = (5.0, 2.5, 1.0, 300.0)
     position: float = 100.0
+    path: float = 2.0
 
 
 CHOICES = {  # by name, for --variant

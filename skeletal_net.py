@@ -320,17 +320,22 @@ def mse(a, b):
     return float(np.mean(d * d, dtype=np.float64)), d * (2.0 / d.size)
 
 
-def rec_loss(y, x, world, world_true, position):
+def rec_loss(y, x, world, world_true, position, path):
     r"""Reconstruction  [SAN-4]: |D(E(S, Q), E(S)) - Q|^2 + |FK(., S) - FK(Q, S)|^2.
 
+    Departs   FK's part is split, as in the published code: joints relative to the root, and its path, whose error
+              adds up over a window and would drown the rest
     Args      y, x : (C, T, B) decoded and given features, standardised; world, world_true : (J, 3, T, B) [legs]
-              position : weight of the second part
+              position, path : weights of the two parts of FK's
     Returns   loss; d y; d world
     Test      tests/test_skeletal.py::test_losses, test_skeletal_train.py::test_whole_loss_gradient
     """
     a, dy = mse(y, x)
-    b, dworld = mse(world, world_true)
-    return a + position * b, dy, position * dworld
+    b, dlocal = mse(world - world[:1], world_true - world_true[:1])
+    c, droot = mse(world[0], world_true[0])
+    dworld = position * dlocal
+    dworld[0] += path * droot - dworld.sum(axis=0)
+    return a + position * b + path * c, dy, dworld
 
 
 def ltc_loss(z_fake, z):

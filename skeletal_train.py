@@ -281,7 +281,7 @@ class Trainer:
         if w["rec"]:
             y, decoded = G.decode_forward(z, features)
             _, world, kin = fk_forward(y * std + mean, off, A.parents, turn)
-            losses["rec"], dy, dworld = rec_loss(y, x, world, real_world, self.choices.position)
+            losses["rec"], dy, dworld = rec_loss(y, x, world, real_world, self.choices.position, self.choices.path)
             dy = w["rec"] * (dy + std * fk_grad(None, dworld, kin))
             d, df2 = G.decode_backward(dy, decoded)
             dz += d
