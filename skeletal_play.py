@@ -114,7 +114,9 @@ class RetargetOptions:
     source: str | None = arg(None, "BVH file to retarget")
     target: str | None = arg(None, "BVH file of the skeleton to move, or A/NUMBER or B/NUMBER: a trained character")
     out: str | None = arg(None, "BVH file to write")
-    weights: str = arg(str(SHIPPED), "run folder or .npz of skeletal.py train; by default what is shipped, if it is", metavar="FILE")
+    weights: str = arg(
+        str(SHIPPED), "run folder or .npz of skeletal.py train; default: the shipped one, if any", metavar="FILE"
+    )
     up: str = arg("y", "axis of the files that points up", choices=("x", "y", "z", "-x", "-y", "-z"))
     drop: str = arg("", "joints to leave out, as in training")
     clean: bool = arg(True, "foot clean-up")
