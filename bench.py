@@ -5,6 +5,7 @@ r"""How fast it is: every part of training beside the physics it cannot beat, in
     python bench.py --scaling                        1 and all threads, 64 to 4,096 environments
     python bench.py --physics                        what other steps, solvers and iterations would cost and spoil
     python bench.py --drop --json OUT                DROP's simulator: drop.{fps, fps_pushed, fps_vae, …}
+    python bench.py --skeletal --json OUT            skeleton-aware networks: skeletal.{windows_per_s, torch_ratio}
 
 physics       bare `mujoco.rollout` of the same model and substeps, from the same states
 environment   `Env.step`: physics, refresh, reward, termination, reset, observation
@@ -36,9 +37,11 @@ import drop_demos
 import mocap
 import ppo
 import retarget
+import skeletal
+import skeletal_net
 from character import geom_lowest
 from env import BAD, SUBSTEPS, Env
-from nn import gaussian_logp
+from nn import Adam, gaussian_logp
 from runs import COUNT, POSITIVE, THREADS, arg, atomic_write, cli, run_main, versions
 
 
@@ -55,6 +58,7 @@ class Options(character.Switches):
     scaling: bool = arg(False, "also the table over threads and environments")
     physics: bool = arg(False, "the table over physics steps, solvers and iterations instead")
     drop: bool = arg(False, "frames a second of DROP's simulator instead, against samples and characters")
+    skeletal: bool = arg(False, "training windows a second of the skeleton-aware networks, against PyTorch, instead")
     json: str | None = arg(None, "write the figures here")
 
 
@@ -221,6 +225,150 @@ def bench_drop(frames=60, rounds=7) -> dict:
     return out
 
 
+SKELETON = (-1, 0, 1, 2, 3, 2, 5, 6, 7, 2, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19)  # a captured human's 21 joints
+
+
+class SkeletalStep:
+    r"""One training step of the skeletal auto-encoder [SAN-4], ours: forward, loss with kinematics, backward, Adam.
+
+    Test      tests/test_bench.py::test_bench_skeletal
+    """
+
+    def __init__(self, batch, rng, window=64):
+        self.net = skeletal_net.Generator(SKELETON, rng)
+        self.adam = Adam(self.net.n_params, 2e-4)
+        self.s = rng.standard_normal((3 * len(SKELETON), batch), dtype=np.float32)
+        self.turn = np.ones((window, batch), complex)
+        x = 0.1 * rng.standard_normal((self.net.n_x, window, batch), dtype=np.float32)
+        x[3::4] += 1.0  # quaternions near 1
+        self.x, self.offsets = x, self.s.reshape(-1, 3, batch)
+        self.true = skeletal.fk_forward(x, self.offsets, SKELETON, self.turn)[1]
+
+    def __call__(self):
+        net = self.net
+        features, static = net.static_forward(self.s)
+        z, encoded = net.encode_forward(self.x, features)
+        y, decoded = net.decode_forward(z, features)
+        _, world, kin = skeletal.fk_forward(y, self.offsets, SKELETON, self.turn)
+        loss, dy, dworld = skeletal_net.rec_loss(y, self.x, world, self.true, 1.0, 1.0)
+        net.grad[:] = 0.0
+        dz, df2 = net.decode_backward(dy + skeletal.fk_backward(None, dworld, kin), decoded)
+        _, df1 = net.encode_backward(dz, encoded, want_dx=False)
+        net.static_backward(df1, df2, static)
+        self.adam.step(net.theta, net.grad)
+        return loss
+
+
+def torch_step(ours: SkeletalStep, torch):
+    """The same step in PyTorch, from the same weights: dense convolutions times a mask, as in the published code.
+
+    Returns   function that makes one step and returns its loss
+    Test      tests/test_bench.py::test_bench_skeletal
+    """
+    F, net = torch.nn.functional, ours.net
+    batch_first = lambda a: torch.tensor(np.ascontiguousarray(np.moveaxis(a, -1, 0)))  # noqa: E731
+
+    def layer(number, plan):
+        W, V, b = net.params[number]
+        dense, static = np.zeros((plan.n_out, plan.n_in, plan.kernel), "f"), np.zeros((plan.n_out, plan.n_static), "f")
+        mask, seen = np.zeros_like(dense), np.zeros_like(static)
+        for o, rows, columns, w, v in zip(plan.out, plan.rows, plan.static_rows, W, V):
+            dense[o.start : o.stop, rows], mask[o.start : o.stop, rows] = w.transpose(1, 2, 0), 1.0
+            if plan.n_static:
+                static[o.start : o.stop, columns], seen[o.start : o.stop, columns] = v, 1.0
+        weights = [torch.nn.Parameter(torch.tensor(a)) for a in (dense, static, b.copy())]
+        return weights, torch.tensor(mask), torch.tensor(seen), plan
+
+    layers = {n: layer(n, p) for n, p in zip((*net.e, *net.d, *net.s), (*net.plans, *net.statics))}
+    adam = torch.optim.Adam([w for weights, *_ in layers.values() for w in weights], 2e-4)
+
+    def merge(groups):
+        m = torch.zeros(len(groups), sum(map(len, groups)))
+        for k, g in enumerate(groups):
+            m[k, g] = 1.0 / len(g)
+        return m
+
+    pools = [merge(net.pool1), merge(net.pool2)]
+    grouped = lambda x, m: (m @ x.reshape(len(x), m.shape[1], -1)).reshape(len(x), -1, *x.shape[2:])  # noqa: E731
+    opened = lambda x, m: grouped(x, (m.T > 0).float())  # noqa: E731
+
+    def conv(number, x, s=None):
+        (w, v, b), mask, seen, plan = layers[number]
+        half = plan.kernel // 2
+        y = F.conv1d(F.pad(x, (half, half), mode="reflect") if half else x, w * mask, b, stride=plan.stride)
+        return y if s is None else y + (s @ (v * seen).T)[..., None]
+
+    leaky = lambda x: F.leaky_relu(x, skeletal.SLOPE)  # noqa: E731
+    up = lambda x: F.interpolate(x, scale_factor=2, mode="linear", align_corners=False)  # noqa: E731
+    x, s, offsets, true = map(batch_first, (ours.x, ours.s, ours.offsets, ours.true))
+    x, true = x.contiguous(), true
+
+    def kinematics(x):  # (B, C, T) -> (B, J, 3, T); the heading stays 0 here
+        q = torch.cat([x[:, None, 3:7], x[:, 7:].reshape(len(x), -1, 4, x.shape[2])], 1)
+        w, i, j, k = (q / q.norm(dim=2, keepdim=True)).unbind(2)
+        rows = [1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j), 2 * (i * j + w * k),
+                1 - 2 * (i * i + k * k), 2 * (j * k - w * i), 2 * (i * k - w * j), 2 * (j * k + w * i),
+                1 - 2 * (i * i + j * j)]  # fmt: skip
+        m = torch.stack(rows, -1).reshape(*w.shape, 3, 3)  # (B, J, T, 3, 3)
+        step = torch.cat([torch.zeros_like(x[:, :2, :1]), x[:, :2, 1:]], 2)
+        root = torch.cat([step.cumsum(2), x[:, 2:3]], 1).transpose(1, 2)
+        g, p = [m[:, 0]], [root]
+        for joint in range(1, len(SKELETON)):
+            above = SKELETON[joint]
+            p.append(p[above] + (g[above] @ offsets[:, joint, None, :, None])[..., 0])
+            g.append(g[above] @ m[:, joint])
+        return torch.stack(p, 1).transpose(2, 3)
+
+    def step():
+        f1 = leaky(grouped(conv(net.s[0], s[..., None]), pools[0]))
+        f2 = leaky(grouped(conv(net.s[1], f1), pools[1]))
+        z = leaky(grouped(conv(net.e[0], x, s), pools[0]))
+        z = leaky(grouped(conv(net.e[1], z, f1[..., 0]), pools[1]))
+        y = leaky(conv(net.d[0], opened(up(z), pools[1]), opened(f2, pools[1])[..., 0]))
+        y = conv(net.d[1], opened(up(y), pools[0]), s)
+        p = kinematics(y)
+        loss = F.mse_loss(y, x) + F.mse_loss(p - p[:, :1], true - true[:, :1]) + F.mse_loss(p[:, 0], true[:, 0])
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        return float(loss.detach())
+
+    return step
+
+
+def bench_skeletal(batch=32, rounds=7) -> dict:
+    r"""Training windows a second of the skeletal auto-encoder, and the same network's in PyTorch, in turn.
+
+    Method    CPU time of the process, one thread each (run it with OMP_NUM_THREADS=1), median over the rounds; the
+              losses of the first steps are compared first: it is the same network
+    Returns   windows_per_s; torch_windows_per_s and torch_ratio (ours over PyTorch's), or None where it is missing
+    Test      tests/test_bench.py::test_bench_skeletal
+    """
+    ours = SkeletalStep(batch, np.random.default_rng(0))
+    out, theirs = {"torch_windows_per_s": None, "torch_ratio": None}, None
+    try:
+        import torch
+
+        torch.set_num_threads(1)
+        theirs = torch_step(ours, torch)
+    except ImportError:
+        print("PyTorch is not installed, so there is nothing to compare with: python -m pip install -e '.[torch]'")
+    pairs = [(ours(), theirs() if theirs else None) for _ in range(2)]
+    if theirs and not np.allclose(*zip(*pairs), rtol=1e-3):
+        raise RuntimeError(f"PyTorch's losses differ from ours: {pairs}")
+    times = {ours: [], theirs: []}
+    for _ in range(rounds):
+        for step in filter(None, (ours, theirs)):
+            start = time.process_time()
+            step()
+            times[step].append(time.process_time() - start)
+    out["windows_per_s"] = float(batch / np.median(times[ours]))
+    if theirs:
+        out["torch_windows_per_s"] = float(batch / np.median(times[theirs]))
+        out["torch_ratio"] = float(np.median(np.array(times[theirs]) / np.array(times[ours])))
+    return out
+
+
 def _seconds(f, repeats):
     t = time.perf_counter()
     for _ in range(repeats):
@@ -231,7 +379,7 @@ def _seconds(f, repeats):
 def main(argv=None):
     """Print the table of every character.  Test: tests/test_bench.py::test_bench_json"""
     opt = cli(Options, argv, "bench.py", __doc__)
-    names = [] if opt.drop else [opt.character] if opt.character else character.available()
+    names = [] if opt.drop or opt.skeletal else [opt.character] if opt.character else character.available()
     print(
         f"{os.cpu_count()} cores, " + ", ".join(f"{k} {v}" for k, v in versions().items() if k in ("numpy", "mujoco"))
     )
@@ -242,6 +390,10 @@ def main(argv=None):
               f"{r['fps_vae']:.0f} with both VAEs")  # fmt: skip
         print("  samples     " + "   ".join(f"{n}: {v:.0f}" for n, v in r["samples"].items()))
         print("  characters  " + "   ".join(f"{k}: {v:.0f}" for k, v in r["characters"].items()))
+    if opt.skeletal:
+        more["skeletal"] = r = bench_skeletal(rounds=opt.rounds)
+        print(f"\nskeletal auto-encoder, one core: {r['windows_per_s']:.0f} training windows/s", end="")
+        print(f"; PyTorch {r['torch_windows_per_s']:.0f}: ratio {r['torch_ratio']:.2f}" if r["torch_ratio"] else "")
     for name in names:
         char = replace(opt, character=name).load()
         ref = retarget.reference(char, mocap.sequences(opt.motion, "train", opt.clips))

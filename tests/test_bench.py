@@ -69,3 +69,20 @@ def test_bench_drop(tmp_path, capsys, monkeypatch):
     assert r["fps"] > 20 and r["fps_pushed"] > 20 and r["fps_vae"] > 10 and set(r["samples"]) == {"1", "4", "64", "256"}
     assert r["characters"]["8"] < 0.5 * r["characters"]["2"] < r["fps"]
     assert "frames/s" in capsys.readouterr().out
+
+
+def test_bench_skeletal(tmp_path, capsys, monkeypatch):
+    """Windows a second; PyTorch's loss is ours to 1e-3 (checked inside), or its absence is said."""
+    short = bench.bench_skeletal
+    monkeypatch.setattr(bench, "bench_skeletal", lambda rounds: short(batch=2, rounds=2))
+    out = tmp_path / "bench.json"
+    bench.main(["--skeletal", "--json", str(out)])
+    r, printed = json.loads(out.read_text())["skeletal"], capsys.readouterr().out
+    assert r["windows_per_s"] > 1 and "training windows/s" in printed
+    if r["torch_ratio"] is None:
+        assert "PyTorch is not installed" in printed
+    else:
+        assert r["torch_ratio"] > 0 and "ratio" in printed
+    step = bench.SkeletalStep(2, np.random.default_rng(0))
+    first = step()
+    assert min(step() for _ in range(3)) < first

@@ -36,6 +36,9 @@ REQUIRED = (
     )),
     *(f"DROP Eq. {k}" for k in range(1, 17)),
     *("DROP Algorithm 1", "DROP §7 rotations"), *(f"DROP §8.{k}" for k in (1, 2, 3, 4, 5, 7)),
+    *(f"SAN-{k}" for k in range(1, 9)),
+    *(f"SAN §{s}" for s in ("4.1", "4.2 static branch", "4.3 unpooling", "3 primal skeleton", "4.4", "5.2 networks")),
+    *("SAN §5 training", "SAN §5.2 clean-up", "SAN metric"),
 )  # fmt: skip
 # Missing, or experiments: these need no code and no test.
 MAY_BE_OPEN = ("Table 1", "Table 3", "§4, §5")

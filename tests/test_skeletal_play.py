@@ -1,0 +1,222 @@
+"""skeletal.py's four commands as a user meets them, and what they write."""
+
+import json
+
+import numpy as np
+import pytest
+from test_skeletal_data import write_rig
+from test_skeletal_train import BODY, NAMES, small_trainer, walk
+
+import bvh
+import skeletal
+import skeletal_data as data
+import skeletal_play as play
+import skeletal_train as st
+from runs import CHECKPOINT, UserError, load_checkpoint, read_metrics, run_main, save_checkpoint
+
+pytestmark = pytest.mark.usefixtures("motions_once")
+
+
+def run(*args):
+    """The exit code of `python skeletal.py ARGS`, run in this process."""
+    with pytest.raises(SystemExit) as end:
+        run_main(skeletal.main, [str(a) for a in args])
+    return end.value.code
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, clips):
+    """A run of two steps on the built-in human, and its prepared windows."""
+    at = tmp_path_factory.mktemp("skeletal")
+    args = "train --clips x --limit 2 --characters 1 --batch 2 --steps 2".split()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(st.mocap, "load", lambda *a, **k: CLIPS)
+        assert run(*args, "--data", at / "windows.npz", "--out", at / "run") == 0
+    return at
+
+
+@pytest.fixture(scope="module", autouse=True)
+def clips(motions_once):
+    """Three short built-in clips stand for all of them."""
+    global CLIPS
+    CLIPS = [c[:66] for c in st.mocap.builtin_clips() if c.name.startswith("walk")][:3]
+
+
+def test_help(capsys):
+    assert run("--help") == 0 and "autoencode" in capsys.readouterr().out
+    for command in play.COMMANDS:
+        assert run(command, "--help") == 0
+        assert "default" in capsys.readouterr().out
+    assert run() == 2 and "valid: train, autoencode, retarget, measure" in capsys.readouterr().err
+    assert run("fly") == 2 and "'fly'" in capsys.readouterr().err
+
+
+def test_train_command(trained, capsys, tmp_path):
+    """A run folder with metrics and a checkpoint; it goes on where it was; the windows are read again."""
+    out = trained / "run"
+    assert read_metrics(out / "metrics.csv")["step"].tolist() == [2]
+    arrays, meta = load_checkpoint(out / CHECKPOINT)
+    assert meta["steps"] == 2 and {"generator0", "critic1", "adam3.m", "offsets1", "std0"} <= set(arrays)
+    again = st.prepared(st.TrainOptions(data=str(trained / "windows.npz")))
+    assert len(again[0].windows) and np.array_equal(again[1].mean, arrays["mean1"])
+    x = again[0].sample(np.random.default_rng(0), 3)[0]
+    assert x.shape == (7 + 4 * 16, st.WINDOW, 3) and x.dtype == np.float32
+    assert run("train", "--resume", "--out", out, "--steps", 3) == 0
+    assert load_checkpoint(out / CHECKPOINT)[1]["steps"] == 3 and "3/3 steps" in capsys.readouterr().out
+    assert run("train", "--out", out) == 2 and "add --resume" in capsys.readouterr().err
+    assert run("train", "--a", tmp_path, "--out", tmp_path / "x") == 2 and "--a and --b" in capsys.readouterr().err
+    assert run("train", "--steps", 0) == 2 and not (tmp_path / "x").exists()
+
+
+def test_ship_and_load(trained, tmp_path):
+    """Generators, characters, statistics and the licence; no optimiser, no critic; the same answers."""
+    assert run("train", "--out", trained / "run", "--ship", tmp_path / "s.npz") == 0
+    arrays, meta = load_checkpoint(tmp_path / "s.npz")
+    assert meta["licence"] == "MIT" and not any(k.startswith(("adam", "critic", "pool")) for k in arrays)
+    a, b = play.Retargeter(trained / "run"), play.Retargeter(tmp_path / "s.npz")
+    m = data.human_motion(CLIPS[0])
+    target = a.domains[1].characters[0]
+    np.testing.assert_array_equal(a(m, 0, target, 1).quat, b(m, 0, target, 1).quat)
+    save_checkpoint(tmp_path / "bad.npz", {"generator0": np.zeros(3)}, {})
+    with pytest.raises(UserError, match="no skeletal checkpoint"):
+        play.Retargeter(tmp_path / "bad.npz")
+    with pytest.raises(UserError, match="no checkpoint"):
+        play.Retargeter(tmp_path)
+
+
+def test_retargeter_any_length(trained):
+    """Whole clips of any length, even shorter than a window; the heading is the source's."""
+    net = play.Retargeter(trained / "run")
+    m = data.human_motion(CLIPS[0])
+    for n in (5, 33, 66):
+        out = net(m[:n], 0, net.domains[1].characters[0], 1)
+        assert len(out) == n and np.isfinite(out.pos).all()
+        np.testing.assert_allclose(np.linalg.norm(out.quat, axis=-1), 1.0)
+
+
+def test_retarget_command(trained, tmp_path, capsys):
+    """Onto a trained character and onto a file, and what is written can be read again; bad input is one line."""
+    net = play.Retargeter(trained / "run")
+    motion = data.human_motion(CLIPS[0])
+    data.write_motion(tmp_path / "a.bvh", motion, net.domains[0].structure)
+    common = ("retarget", "--weights", trained / "run", "--source", tmp_path / "a.bvh", "--up", "z")
+    assert run(*common, "--target", "B/0", "--out", tmp_path / "b.bvh") == 0
+    assert "structure A -> B" in capsys.readouterr().out
+    b = bvh.read(tmp_path / "b.bvh")
+    assert set(b.names) == set(net.domains[1].names) and len(b.values) == 66
+    assert run(*common, "--target", tmp_path / "b.bvh", "--out", tmp_path / "c.bvh", "--no-clean") == 0
+    assert set(bvh.read(tmp_path / "c.bvh").names) == set(net.domains[1].names)
+    for args, says in (
+        ((*common, "--target", "B/9", "--out", tmp_path / "d.bvh"), "B/0 to B/0"),
+        (common, "give --source"),
+        ((*common[:3], "--source", tmp_path / "no.bvh", "--target", "B/0", "--out", tmp_path / "d.bvh"), "no.bvh"),
+        ((*common, "--target", "B/0", "--out", tmp_path / "no" / "d.bvh"), "cannot write"),
+    ):
+        capsys.readouterr()
+        assert run(*args) == 2
+        err = capsys.readouterr().err
+        assert says in err and err.count("\n") == 1
+    write_rig(tmp_path / "rig.bvh", walk(70))
+    assert run(*common[:3], "--source", tmp_path / "rig.bvh", "--target", "B/0", "--out", tmp_path / "d.bvh") == 2
+    assert "no trained structure has the joints hips" in capsys.readouterr().err
+    assert not (tmp_path / "d.bvh").exists()
+
+
+def test_pictures(trained, tmp_path):
+    m = data.human_motion(CLIPS[0])
+    try:
+        play._pictures([m, m], ["a", "b"], tmp_path / "s.png", None, 1.0)
+    except UserError as e:
+        pytest.skip(f"no software OpenGL: {e}")
+    assert (tmp_path / "s.png").stat().st_size > 5000
+
+
+def test_own_folders(tmp_path):
+    """Two rigs of a user's own, joints in another order, frames and rest poses of their own: trained on as they are."""
+    other = data.derive(BODY)
+    order = [0, *range(3, 8), 1, 2, *range(8, 13)]  # left leg before the trunk
+    names = tuple(other.names[j] for j in order)
+    assert names[1].startswith("thigh") and len(order) == len(other.names)
+    at = {j: i for i, j in enumerate(order)}
+    parents = (-1, *(at[other.parents[j]] for j in order[1:]))
+    mixed = data.Skeleton(names, parents, other.offsets[order], tuple(at[f] for f in other.feet))
+    for k, s in enumerate((BODY, mixed)):
+        (tmp_path / str(k)).mkdir()
+        frames = None
+        for i in range(2):
+            frames = write_rig(tmp_path / str(k) / f"{i}.bvh", walk(70, s, i), frames, seed=k)
+    opt = st.TrainOptions(a=str(tmp_path / "0"), b=str(tmp_path / "1"), batch=2)
+    domains = st.own_folders(opt)
+    assert domains[0].names == NAMES and domains[1].names == other.names
+    assert [domains[0].names[e] for e in domains[0].ends] == [domains[1].names[e] for e in domains[1].ends]
+    tr = st.Trainer(opt, domains, channels=(2, 3))
+    assert np.isfinite(list(tr.step().values())).all()
+    (tmp_path / "2").mkdir()
+    short = data.Skeleton(NAMES[:7], (-1, 0, 1, 0, 3, 4, 5), BODY.offsets[:7], (6,))
+    write_rig(tmp_path / "2" / "a.bvh", walk(70, short))
+    with pytest.raises(UserError, match="no common primal skeleton"):
+        st.own_folders(st.TrainOptions(a=str(tmp_path / "0"), b=str(tmp_path / "2")))
+
+
+def test_families_are_unpaired(monkeypatch):
+    """No clip is on two characters; the first character is the actor."""
+    monkeypatch.setattr(st.mocap, "load", lambda *a, **k: CLIPS[:2])
+    seen = []
+    truth = data.truth
+    monkeypatch.setattr(data, "truth", lambda m, c: seen.append(m.name) or truth(m, c))
+    a, b = st.families(st.TrainOptions(characters=1))
+    assert len(a.arrays) == len(b.arrays) == 2 and len(seen) == 1  # one clip each, both ways in time
+    assert len(b.names) == len(data.derive(a.characters[0]).names)
+
+
+def test_measure_command(trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(st.mocap, "load", lambda *a, **k: CLIPS[:1])
+    assert run("measure", "--weights", trained / "run", "--json", tmp_path / "m.json") == 0
+    r = json.loads((tmp_path / "m.json").read_text())
+    assert {"cross", "intra", "copy_cross", "copy_intra", "cross_clean", "slide", "slide_clean"} <= set(r)
+    assert r["copy_cross"] == min(v["cross"] for v in r["rows"]["copies"].values()) > 0
+    assert r["cross"] > 10 * r["copy_cross"]  # two steps do not teach anything
+    assert r["slide_clean"] < r["slide"] and "copy (names" in capsys.readouterr().out
+
+
+def test_noise():
+    opt = play.AutoOptions(zeros=0.25)
+    x = np.ones((400, 7 + 4 * 4), np.float32)
+    r = np.random.default_rng(0)
+    g = play.noisy(x, "gaussian", opt, r) - x
+    assert g[:, 3:].std() == pytest.approx(0.01, rel=0.05) and not g[:, :3].any()
+    z = play.noisy(x, "zeros", opt, r)
+    q = z[:, 3:].reshape(400, 5, 4)
+    assert np.all((q == 0).all(-1) | (q == 1).all(-1)) and (q == 0).mean() == pytest.approx(0.25, abs=0.04)
+    assert np.array_equal(play.noisy(x, "clean", opt, r), x)
+
+
+def test_autoencode_command(tmp_path, monkeypatch, capsys):
+    """Both networks learn; a finished network is not trained again."""
+    monkeypatch.setattr(st.mocap, "load", lambda *a, **k: CLIPS)
+    args = (
+        "autoencode",
+        "--steps",
+        8,
+        "--batch",
+        4,
+        "--seeds",
+        0,
+        "--out",
+        tmp_path / "a",
+        "--json",
+        tmp_path / "a.json",
+    )
+    assert run(*args) == 0
+    first = json.loads((tmp_path / "a.json").read_text())
+    assert {f"{k}_{n}" for k in ("skeletal", "plain") for n in ("clean", "gaussian", "zeros")} <= set(first)
+    assert first["skeletal_zeros"] > first["skeletal_clean"] > 0
+    capsys.readouterr()
+    assert run(*args, "--resume") == 0 and "steps skeletal" not in capsys.readouterr().out
+    assert json.loads((tmp_path / "a.json").read_text()) == first
+
+
+def test_small_trainer_is_small():
+    """The fixture of the gradient tests has two structures whose latents fit."""
+    tr = small_trainer()
+    assert tr.nets[0].n_latent == tr.nets[1].n_latent and len(tr.domains[0].names) < len(tr.domains[1].names)

@@ -1,0 +1,124 @@
+"""skeletal_train.py: the whole losses' gradients, steps, resuming, statistics."""
+
+import numpy as np
+import pytest
+from test_skeletal import check_along
+
+import skeletal
+import skeletal_data as data
+import skeletal_train as st
+from skeletal_data import Motion, Skeleton
+
+NAMES = ("hips", "spine", "chest", "thigh_l", "shin_l", "foot_l", "toe_l", "thigh_r", "shin_r", "foot_r", "toe_r")
+PARENTS = (-1, 0, 1, 0, 3, 4, 5, 0, 7, 8, 9)
+LEG = [[0.05, 0, -0.4], [-0.05, 0, -0.4], [0.15, 0, -0.08]]
+OFFSETS = np.array([[0, 0, 0], [0, 0, 0.2], [0, 0, 0.3], [0, 0.1, 0], *LEG, [0, -0.1, 0], *LEG], float)
+BODY = Skeleton(NAMES, PARENTS, OFFSETS, (6, 10))
+
+
+def walk(n=80, skeleton=BODY, seed=0, name="walk_001"):
+    """A motion of smooth random turns that travels."""
+    r, t = np.random.default_rng(seed), np.arange(n) / data.RATE
+    J = len(skeleton.names)
+    angle = 0.25 * np.sin(2 * np.pi * (r.uniform(0.5, 1.2, (J, 3)) * t[:, None, None] + r.uniform(0, 1, (J, 3))))
+    angle[:, 0, 2] += 0.4 * t
+    q = data.quat_about(0, angle[..., 0])
+    for axis in (1, 2):
+        q = data.quat_mul(data.quat_about(axis, angle[..., axis]), q)
+    pos = np.stack([1.2 * t, 0.1 * np.sin(t), 0.92 + 0.02 * np.sin(9 * t)], axis=1)
+    return Motion(name, skeleton, pos, q)
+
+
+def small_trainer(dtype=np.float32, **settings):
+    """Two structures, two characters each, without files."""
+    opt = st.TrainOptions(**({"batch": 2, "characters": 2} | settings))
+    r = np.random.default_rng(0)
+    domains = []
+    for s, seed in ((BODY, 0), (data.derive(BODY), 10)):
+        cast = [data.proportions(s, r) for _ in range(2)]
+        structure = st.derived_structure(s, data.Structure((), (), None, (), (), "z", 1.0))
+        clips = [(k, walk(70 + 20 * k, c, seed + k)) for k, c in enumerate(cast)]
+        domains.append(st.Domain(cast, clips, structure=structure))
+    return st.Trainer(opt, domains, dtype, (2, 3))
+
+
+# ------------------------------------------------------------------------------------ losses and steps
+
+
+@pytest.mark.parametrize("n, without", [(0, None), (1, None), *((1, term) for term in st.TERMS)])
+def test_whole_loss_gradient(n, without):
+    """[SAN-8] of one direction, cross and within, with each loss left out once: both generators' whole gradients."""
+    tr = small_trainer(np.float64, without=without)
+    rng = np.random.default_rng(1)
+    x, turn, who = tr.domains[0].sample(rng, 2)
+    batch = (x.astype(float), turn, who)
+    targets = np.array([0, 1])
+    for net in (*tr.nets, *tr.critics):
+        net.theta += 0.1 * rng.standard_normal(net.theta.shape)
+
+    def loss():
+        kept = [net.grad.copy() for net in (*tr.nets, *tr.critics)]
+        losses, *_ = tr.direction(0, n, batch, targets)
+        for net, g in zip((*tr.nets, *tr.critics), kept):
+            net.grad[:] = g
+        return sum(tr.weights[k] * v for k, v in losses.items())
+
+    losses, *_ = tr.direction(0, n, batch, targets)
+    assert set(losses) == set(st.TERMS) - {without}
+    for net in tr.nets[: n + 1]:
+        u = rng.standard_normal(net.theta.shape)
+        check_along(net.theta, u, loss, net.grad @ u, 3e-7)
+    assert np.any(tr.nets[1].grad) == (n == 1)
+
+
+def test_step_learns():
+    tr = small_trainer(lr=5e-3)
+    first = [tr.step() for _ in range(5)]
+    for _ in range(25):
+        tr.step()
+    last = [tr.step() for _ in range(5)]
+    mean = lambda rows, k: np.mean([r[k] for r in rows])  # noqa: E731
+    assert mean(last, "rec") < 0.5 * mean(first, "rec")
+    assert all(np.isfinite(list(r.values())).all() for r in last)
+
+
+def test_resume_is_exact():
+    a, b = small_trainer(), small_trainer(seed=5)
+    for _ in range(3):
+        a.step()
+    arrays = {k: np.array(v) for k, v in a.arrays().items()}
+    b.load(arrays, {"rng": st.rng_state(a.rng), "steps": 3})
+    for tr in (a, b):
+        tr.step(), tr.step()
+    assert all(np.array_equal(x.theta, y.theta) for x, y in zip((*a.nets, *a.critics), (*b.nets, *b.critics)))
+    assert a.step_count == b.step_count == 5
+
+
+def test_variants_differ():
+    """Each side of the errata table is another loss or another network."""
+    rows = []
+    for variant in skeletal.CHOICES:
+        tr = small_trainer(variant=variant)
+        rows.append(tr.step())
+    assert len({round(r["rec"], 9) for r in rows}) == 3
+    assert [tuple(skeletal.CHOICES[v].weights) for v in ("paper", "code")] == [(1, 1, 0.25, 2), (5, 2.5, 1, 333)]
+
+
+def test_statistics():
+    """Per character; one deviation an armature; a stranger's from its nearest proportions."""
+    d = small_trainer().domains[0]
+    x = np.concatenate([x for k, x, _ in d.arrays if k == 1])
+    np.testing.assert_allclose(d.mean[1], x.mean(axis=0), atol=1e-5)
+    assert d.std[1][7:11].std() == 0 and d.std[1][7] == pytest.approx(
+        max(np.sqrt(x[:, 7:11].var(0).mean()), 0.02), rel=1e-4
+    )
+    np.testing.assert_allclose(d.statistics_of(d.characters[1])[0], d.mean[1], atol=2e-2)
+    half = data.replace(
+        BODY,
+        offsets=np.exp(
+            0.5 * (np.log(np.abs(d.characters[0].offsets) + 1e-9) + np.log(np.abs(d.characters[1].offsets) + 1e-9))
+        ),
+    )  # noqa: E501
+    mean = d.statistics_of(half)[0]
+    low, high = np.minimum(*d.mean) - 1e-6, np.maximum(*d.mean) + 1e-6
+    assert np.all((mean >= low) & (mean <= high))
