@@ -8,7 +8,6 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -353,11 +352,9 @@ def test_rate_follows_kl_and_sigma_has_a_floor(char, ref):
 class Reach:
     """Points on a line, with the interface of Env: go to the target and stay; |x| > 2 fails, 12 steps truncate."""
 
-    ENDS = Env.ENDS
+    ENDS, TERMS, name, training = Env.ENDS, Env.TERMS, "reach", {}
     obs_size, critic_size, action_size, dt = 2, 3, 1, 0.1
-    char = SimpleNamespace(
-        name="reach", training={}, reward={k: (float(k == "q"), 1.0) for k in TERMS} | {"fail": -5.0}
-    )
+    value_scale, stats = (lambda self, gamma: 1.0 / (1.0 - gamma)), (lambda self: {})
 
     def __init__(self, n):
         self.n, self.full = n, np.zeros((n, 3), np.float32)
