@@ -469,7 +469,7 @@ def train_sb3(opt: Options) -> dict:
         from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
     except ImportError:
         raise UserError(NO_SB3) from None
-    envs = VecNormalize(DummyVecEnv([lambda: Monitor(make(opt.task))]))
+    envs = VecNormalize(DummyVecEnv([lambda: Monitor(gymnasium.wrappers.FlattenObservation(make(opt.task)))]))
     model, began = PPO("MlpPolicy", envs, seed=opt.seed, device="cpu"), time.perf_counter()
     model.learn(opt.steps)
     returns = [e["r"] for e in model.ep_info_buffer]
