@@ -311,7 +311,8 @@ def bench_peers(char, ref, opt: Options) -> dict:
               Stable-Baselines3's inputs are normalised by its VecNormalize, as ours are.  Its critic sees what the
               actor does and not the human (189 numbers for Jesse, not 369), which makes its work less
     Returns   control steps a second of the three (medians), ours_of_sb3_batched, ours_of_sb3_subproc and
-              torch_update_ratio (medians of the rounds' ratios), torch_threads
+              torch_update_ratio (medians of the rounds' ratios); cpu_s : name -> seconds of this process's CPU time for
+              what was timed, which other programs disturb less; torch_threads
     Raises    UserError: stable-baselines3 is not installed
     Test      tests/test_bench.py::test_bench_peers
     """
@@ -347,21 +348,29 @@ def bench_peers(char, ref, opt: Options) -> dict:
         models = {"sb3_batched": sb3(batched), "sb3_subproc": sb3(apart)}
         times = {k: [] for k in ("ours", *models, "update", "torch")}
         for k in range(opt.rounds + 1):
-            now = {"update": _seconds(trainer.update, 1), "torch": _seconds(by_torch, 1)}
-            now["ours"] = now["update"] + _seconds(trainer.collect, 1)
-            now |= {
-                name: _seconds(lambda: model.learn(samples, reset_num_timesteps=False), 1)  # noqa: B023
-                for name, model in models.items()
-            }
+            now = {"update": _two_clocks(trainer.update), "torch": _two_clocks(by_torch)}
+            now["ours"] = now["update"] + _two_clocks(trainer.collect)
+            for name, model in models.items():
+                now[name] = _two_clocks(lambda: model.learn(samples, reset_num_timesteps=False))  # noqa: B023
             if k:  # the first round is to warm up
                 [times[name].append(seconds) for name, seconds in now.items()]
     finally:
         apart.close()
-    times = {k: np.array(t) for k, t in times.items()}
+    cpu = {k: float(np.median(t, 0)[1]) for k, t in times.items() if k != "sb3_subproc"}
+    times = {k: np.array(t)[:, 0] for k, t in times.items()}
     out = {k: float(samples / np.median(times[k])) for k in ("ours", *models)}
     out |= {f"ours_of_{k}": float(np.median(times[k] / times["ours"])) for k in models}
     out["torch_update_ratio"] = float(np.median(times["torch"] / times["update"]))
-    return out | {"envs": opt.envs, "processes": opt.processes, "torch_threads": torch.get_num_threads()}
+    return out | {
+        "cpu_s": cpu, "envs": opt.envs, "processes": opt.processes, "torch_threads": torch.get_num_threads()
+    }  # fmt: skip
+
+
+def _two_clocks(f):
+    """Seconds on the wall, seconds of CPU time.  (2,)"""
+    wall, cpu = time.perf_counter(), time.process_time()
+    f()
+    return np.array([time.perf_counter() - wall, time.process_time() - cpu])
 
 
 def _seconds(f, repeats):
@@ -393,6 +402,7 @@ def main(argv=None):
         for k in ("sb3_batched", "sb3_subproc"):
             print(f"  {k:12s} {r[k]:10,.0f}   ours {r[f'ours_of_{k}']:.2f} × as fast")
         print(f"  an update by PyTorch takes {r['torch_update_ratio']:.2f} × as long")
+        print("  CPU seconds an update: " + ", ".join(f"{k} {v:.2f}" for k, v in r["cpu_s"].items()))
     for name in names:
         char = replace(opt, character=name).load()
         ref = retarget.reference(char, mocap.sequences(opt.motion, "train", opt.clips))

@@ -421,7 +421,10 @@ class Task:
         if len(meta["starts"]) != self.n or not all(type(r) in (int, float) for r in meta["recent"]):
             raise ValueError(f"env: {len(meta['starts'])} episodes, expected {self.n}; or returns that are no numbers")
         if self.scale is not None:
-            self.scale.load_state({k: arrays[f"scale.{k}"] for k in ("count", "mean", "m2")})
+            scale = {k: arrays[f"scale.{k}"] for k in ("count", "mean", "m2")}
+            if scale["count"].min() < 0 or not np.all(scale["m2"] >= 0):
+                raise ValueError("env.scale holds no count and sum of squares")
+            self.scale.load_state(scale)
         self.recent = deque(meta["recent"], RECENT)
         for i, env in enumerate(self.envs):
             actions = arrays[f"actions{i}"]

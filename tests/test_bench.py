@@ -104,7 +104,10 @@ def test_bench_peers(tmp_path, monkeypatch, capsys):
     small = "--envs", "8", "--processes", "2", "--rounds", "2", "--threads", "1"
     bench.main(["--peers", *small, "--json", str(out)])
     r = json.loads(out.read_text())["peers"]
-    assert {"ours", "sb3_batched", "sb3_subproc", "torch_update_ratio"} <= set(r) and min(r.values()) > 0
+    assert {"ours", "sb3_batched", "sb3_subproc", "torch_update_ratio"} <= set(r)
+    assert set(r["cpu_s"]) == {"ours", "update", "torch", "sb3_batched"}
+    assert min(v for k, v in r.items() if k != "cpu_s") > 0 < min(r["cpu_s"].values())
+    assert r["cpu_s"]["update"] < r["cpu_s"]["ours"]
     for k in ("sb3_batched", "sb3_subproc"):  # medians of two: a ratio of means and a mean of ratios
         assert r[f"ours_of_{k}"] == pytest.approx(r["ours"] / r[k], rel=0.5)
     assert f"{r['sb3_subproc']:,.0f}" in capsys.readouterr().out

@@ -160,6 +160,9 @@ def test_render(char, ref):
 def test_sb3_trains_on_both(char, ref):
     """Stable-Baselines3's PPO takes the batch and the single character, and its weights move."""
     sb3 = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed (extra peers)")
+    from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+    sb3_check_env(envs.as_gymnasium(char, ref))
     batch = gym_env.as_sb3(envs.as_gymnasium(char, ref, 8, horizon=10, threads=1))
     for given, n in ((batch, 8), (envs.as_gymnasium(char, ref, horizon=10), 1)):
         model = sb3.PPO("MlpPolicy", given, n_steps=64 // n, batch_size=32, n_epochs=2, seed=0, device="cpu")
@@ -385,6 +388,13 @@ def test_cleanrl_settings(tmp_path):
     assert meta["data"]["task"] == "Point-v0" and ppo.Options().activation == "leaky_relu"
     row = read_metrics(tmp_path / "a" / METRICS)
     assert row["end_time"].sum() + row["end_fail"].sum() == row["episodes"].sum() > 2
+    # its policy can be gone on from, by one of the same activation
+    more = ["--gym", "Point-v0", *tiny, "--init", str(tmp_path / "a")]
+    ppo.main([*more, "--out", str(tmp_path / "b")])
+    a, b = (load_checkpoint(tmp_path / d / CHECKPOINT)[0] for d in "ab")
+    assert b["policy.norm.count"] == a["policy.norm.count"] + 64 and b["adam_pi.t"] == a["adam_pi.t"]
+    with pytest.raises(UserError, match="give --activation tanh"):
+        ppo.main([*more, "--activation", "leaky_relu", "--out", str(tmp_path / "c")])
 
 
 def test_wrong_tasks(tmp_path, capsys, monkeypatch):
@@ -461,6 +471,11 @@ def test_unrepeatable_task(monkeypatch, capsys):
     for name, value in (("full", np.zeros((3, 2), np.float32)), ("actions0", np.zeros((5, 1))), ("steps", np.ones(2))):
         with pytest.raises(ValueError, match=f"env.{name}"):
             other.load_state(arrays | {name: value}, meta)
+    scaled = gym_env.Task("Point-v0", 2, reward_norm=True)
+    scaled.reset(0)
+    arrays_s, meta_s = scaled.state()
+    with pytest.raises(ValueError, match="env.scale"):
+        scaled.load_state(arrays_s | {"scale.m2": np.array([-1.0])}, meta_s)
     with pytest.raises(ValueError, match="1 episodes, expected 2"):
         other.load_state(arrays, meta | {"starts": meta["starts"][:1]})
 
