@@ -6,6 +6,8 @@ r"""How fast it is: every part of training beside the physics it cannot beat, in
     python bench.py --physics                        what other steps, solvers and iterations would cost and spoil
     python bench.py --drop --json OUT                DROP's simulator: drop.{fps, fps_pushed, fps_vae, …}
     python bench.py --skeletal --json OUT            skeleton-aware networks: skeletal.{windows_per_s, torch_ratio}
+    python bench.py --peers --json OUT               the same training by others: peers.{ours, sb3_batched, sb3_subproc,
+                                                     torch_update_ratio, ...}
 
 physics       bare `mujoco.rollout` of the same model and substeps, from the same states
 environment   `Env.step`: physics, refresh, reward, termination, reset, observation
@@ -19,6 +21,7 @@ rounds: a disturbance of the machine hits all of them, so the ratios can be trus
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import resource
@@ -34,6 +37,7 @@ from mujoco import rollout
 import character
 import drop
 import drop_demos
+import gym_env
 import mocap
 import ppo
 import retarget
@@ -41,8 +45,20 @@ import skeletal
 import skeletal_net
 from character import geom_lowest
 from env import BAD, SUBSTEPS, Env
-from nn import Adam, gaussian_logp
-from runs import COUNT, POSITIVE, THREADS, arg, atomic_write, cli, run_main, versions
+from nn import LEAKY_SLOPE, Adam, gaussian_logp
+from runs import (
+    COUNT,
+    POSITIVE,
+    THREADS,
+    UserError,
+    arg,
+    atomic_write,
+    cli,
+    rng_from_state,
+    rng_state,
+    run_main,
+    versions,
+)
 
 
 @dataclass
@@ -59,6 +75,8 @@ class Options(character.Switches):
     physics: bool = arg(False, "the table over physics steps, solvers and iterations instead")
     drop: bool = arg(False, "frames a second of DROP's simulator instead, against samples and characters")
     skeletal: bool = arg(False, "training windows a second of the skeleton-aware networks, against PyTorch, instead")
+    peers: bool = arg(False, "training by Stable-Baselines3 and an update by PyTorch instead, beside ours")
+    processes: int = arg(8, "with --peers: characters of SubprocVecEnv, a process each", check=COUNT)
     json: str | None = arg(None, "write the figures here")
 
 
@@ -369,6 +387,141 @@ def bench_skeletal(batch=32, rounds=7) -> dict:
     return out
 
 
+def torch_update(trainer: ppo.Trainer):
+    """What `ppo.Trainer.update` does to the weights, by PyTorch's automatic gradients.
+
+    Args      trainer : has collected; only read, and its random state is left as it was
+    Returns   function without arguments that does the update once more, from the same samples, and returns the weights
+              (policy with log σ, critic) after it; the weights go on from call to call
+    Raises    ValueError: options that are not written here
+    Test      tests/test_bench.py::test_torch_updates_as_we_do
+    """
+    import torch
+
+    opt, policy, rng = trainer.opt, trainer.policy, rng_from_state(rng_state(trainer.rng))
+    if opt.joint_clip or opt.value_clip or opt.standardise_minibatch or opt.schedule != "linear":
+        raise ValueError("only the paper's losses, with a linear schedule, are written in PyTorch")
+    nets = []
+    for mine in (policy.actor, policy.critic):
+        layers = []
+        for i in range(mine.n_layers):
+            layers.append(torch.nn.Linear(mine.sizes[i], mine.sizes[i + 1]))
+            with torch.no_grad():
+                layers[-1].weight[:] = torch.tensor(mine.params[f"W{i}"].T)
+                layers[-1].bias[:] = torch.tensor(mine.params[f"b{i}"])
+            layers.append(torch.nn.LeakyReLU(LEAKY_SLOPE))
+        nets.append(torch.nn.Sequential(*layers[:-1]))
+    actor, critic = nets
+    log_std = torch.nn.Parameter(torch.tensor(policy.log_std))
+    of_policy = [*actor.parameters(), log_std]
+    left = max(1.0 - (trainer.steps - trainer.reward.size) / opt.steps, 0.0)
+    adams = [
+        torch.optim.Adam(p, lr=left * lr, eps=opt.adam_eps)
+        for p, lr in ((of_policy, opt.lr), (list(critic.parameters()), opt.value_lr))
+    ]
+
+    def weights():
+        flat = lambda net: [p.detach().numpy().T.ravel() for p in net.parameters()]  # noqa: E731
+        return np.concatenate([*flat(actor), log_std.detach().numpy()]), np.concatenate(flat(critic))
+
+    def update():
+        done = trainer.terminated | trainer.truncated
+        advantage, target = ppo.gae(trainer.reward, trainer.old_value, trainer.next_value, done, opt.gamma, opt.lam)
+        flat = lambda v: torch.from_numpy(np.ascontiguousarray(v.reshape(-1, *v.shape[2:]), np.float32))  # noqa: E731
+        x, action, logp_old = flat(trainer.x), flat(trainer.action), flat(trainer.logp)
+        adv, target = flat(ppo.standardise(advantage)), flat(target / policy.value_scale)
+        for _ in range(opt.epochs):
+            order = torch.from_numpy(rng.permutation(len(adv)))
+            for rows in torch.split(order, opt.minibatch):
+                xb, ab = x[rows], adv[rows]
+                pi = torch.distributions.Normal(actor(xb[:, : policy.obs_size]), log_std.exp(), validate_args=False)
+                ratio = torch.exp(pi.log_prob(action[rows]).sum(-1) - logp_old[rows])
+                loss = -torch.min(ratio * ab, torch.clamp(ratio, 1 - opt.clip_eps, 1 + opt.clip_eps) * ab).mean()
+                v_loss = 0.5 * torch.square(critic(xb)[:, 0] - target[rows]).mean()
+                for each, adam, parameters in ((loss, adams[0], of_policy), (v_loss, adams[1], critic.parameters())):
+                    adam.zero_grad(set_to_none=True)
+                    each.backward()
+                    torch.nn.utils.clip_grad_norm_(parameters, opt.max_grad_norm)
+                    adam.step()
+                with torch.no_grad():
+                    log_std.clamp_(min=float(np.log(opt.min_sigma)))
+        return weights()
+
+    return update
+
+
+def bench_peers(char, ref, opt: Options) -> dict:
+    r"""The same training written by others, in turn with ours: as many samples, minibatches, epochs, layers and units.
+
+    Method    ours         `ppo.Trainer`, collect and update
+              sb3_batched  Stable-Baselines3's PPO over the same N characters simulated together (`gym_env.as_sb3`)
+              sb3_subproc  its PPO over `opt.processes` single characters (`gym_env.OneCharacter`) in SubprocVecEnv
+              torch_update_ratio  seconds of the same update by PyTorch, over ours
+              Stable-Baselines3's inputs are normalised by its VecNormalize, as ours are.  Its critic sees what the
+              actor does and not the human (189 numbers for Jesse, not 369), which makes its work less
+    Returns   control steps a second of the three (medians), ours_of_sb3_batched, ours_of_sb3_subproc and
+              torch_update_ratio (medians of the rounds' ratios); cpu_s : name -> seconds of this process's CPU time for
+              what was timed, which other programs disturb less; torch_threads
+    Raises    UserError: stable-baselines3 is not installed
+    Test      tests/test_bench.py::test_bench_peers
+    """
+    try:
+        import torch
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+    except ImportError:
+        raise UserError(gym_env.NO_SB3) from None
+    # a schedule by KL divergence could leave out epochs
+    settings = ppo.Options(envs=opt.envs, threads=opt.threads, schedule="linear", steps=10**9)
+    trainer = ppo.Trainer(settings, Env(char, ref, opt.envs, threads=opt.threads))
+    trainer.start()
+    trainer.collect()
+    by_torch = torch_update(trainer)
+    samples = settings.horizon * opt.envs
+
+    def sb3(envs):
+        return PPO(
+            "MlpPolicy", VecNormalize(envs, norm_reward=False), n_steps=samples // envs.num_envs, device="cpu", seed=0,
+            batch_size=settings.minibatch, n_epochs=settings.epochs, gamma=settings.gamma, gae_lambda=settings.lam,
+            clip_range=settings.clip_eps, learning_rate=settings.lr, max_grad_norm=settings.max_grad_norm,
+            policy_kwargs={
+                "net_arch": {"pi": list(settings.hidden), "vf": list(settings.value_hidden)},
+                "activation_fn": torch.nn.LeakyReLU, "log_std_init": float(np.log(trainer.opt.sigma)),
+            },
+        )  # fmt: skip
+
+    batched = gym_env.as_sb3(gym_env.Characters(char, ref, opt.envs, threads=opt.threads))
+    single = functools.partial(gym_env.OneCharacter, char, ref)
+    apart = SubprocVecEnv([functools.partial(single, seed=i) for i in range(opt.processes)])
+    try:
+        models = {"sb3_batched": sb3(batched), "sb3_subproc": sb3(apart)}
+        times = {k: [] for k in ("ours", *models, "update", "torch")}
+        for k in range(opt.rounds + 1):
+            now = {"update": _two_clocks(trainer.update), "torch": _two_clocks(by_torch)}
+            now["ours"] = now["update"] + _two_clocks(trainer.collect)
+            for name, model in models.items():
+                now[name] = _two_clocks(lambda: model.learn(samples, reset_num_timesteps=False))  # noqa: B023
+            if k:  # the first round is to warm up
+                [times[name].append(seconds) for name, seconds in now.items()]
+    finally:
+        apart.close()
+    cpu = {k: float(np.median(t, 0)[1]) for k, t in times.items() if k != "sb3_subproc"}
+    times = {k: np.array(t)[:, 0] for k, t in times.items()}
+    out = {k: float(samples / np.median(times[k])) for k in ("ours", *models)}
+    out |= {f"ours_of_{k}": float(np.median(times[k] / times["ours"])) for k in models}
+    out["torch_update_ratio"] = float(np.median(times["torch"] / times["update"]))
+    return out | {
+        "cpu_s": cpu, "envs": opt.envs, "processes": opt.processes, "torch_threads": torch.get_num_threads()
+    }  # fmt: skip
+
+
+def _two_clocks(f):
+    """Seconds on the wall, seconds of CPU time.  (2,)"""
+    wall, cpu = time.perf_counter(), time.process_time()
+    f()
+    return np.array([time.perf_counter() - wall, time.process_time() - cpu])
+
+
 def _seconds(f, repeats):
     t = time.perf_counter()
     for _ in range(repeats):
@@ -379,7 +532,8 @@ def _seconds(f, repeats):
 def main(argv=None):
     """Print the table of every character.  Test: tests/test_bench.py::test_bench_json"""
     opt = cli(Options, argv, "bench.py", __doc__)
-    names = [] if opt.drop or opt.skeletal else [opt.character] if opt.character else character.available()
+    other = opt.drop or opt.skeletal or opt.peers
+    names = [] if other else [opt.character] if opt.character else character.available()
     print(
         f"{os.cpu_count()} cores, " + ", ".join(f"{k} {v}" for k, v in versions().items() if k in ("numpy", "mujoco"))
     )
@@ -394,6 +548,16 @@ def main(argv=None):
         more["skeletal"] = r = bench_skeletal(rounds=opt.rounds)
         print(f"\nskeletal auto-encoder, one core: {r['windows_per_s']:.0f} training windows/s", end="")
         print(f"; PyTorch {r['torch_windows_per_s']:.0f}: ratio {r['torch_ratio']:.2f}" if r["torch_ratio"] else "")
+    if opt.peers:
+        char = replace(opt, character=opt.character or "jesse").load()
+        more["peers"] = r = bench_peers(
+            char, retarget.reference(char, mocap.sequences(opt.motion, "train", opt.clips)), opt
+        )
+        print(f"\n{char.name}, {opt.envs} characters, training, control steps/s:\n  {'ours':12s} {r['ours']:10,.0f}")
+        for k in ("sb3_batched", "sb3_subproc"):
+            print(f"  {k:12s} {r[k]:10,.0f}   ours {r[f'ours_of_{k}']:.2f} × as fast")
+        print(f"  an update by PyTorch takes {r['torch_update_ratio']:.2f} × as long")
+        print("  CPU seconds an update: " + ", ".join(f"{k} {v:.2f}" for k, v in r["cpu_s"].items()))
     for name in names:
         char = replace(opt, character=name).load()
         ref = retarget.reference(char, mocap.sequences(opt.motion, "train", opt.clips))

@@ -7,6 +7,7 @@ r"""The environment: N characters, each driven by a headset and two controllers 
     reward_*     Eqs. 5 to 11     one pure function a term; Table 2's weights come from characters/NAME.toml
     ablated      §3.5.1, §4.3     the same with less reward; `headset_only` (§4.2) and `asymmetric` (§5.3): less to see
     Env          §3.6, §3.7       reset and step as Gymnasium's vector environments have them
+    as_gymnasium                  the same as a gymnasium.vector.VectorEnv, or one character as a gymnasium.Env
 
 After a physics step MuJoCo's positions, velocities and contacts still belong to the state before the last substep;
 `Env.refresh` recomputes positions and velocities at the new state.
@@ -19,9 +20,10 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from character import TERMS, Character, geom_lowest
+import mocap
+from character import TERMS, Character, geom_lowest, load
 from mocap import heading, quat_angle
-from retarget import STAGE_VEL, Reference, body_velocity
+from retarget import STAGE_VEL, Reference, body_velocity, reference
 from runs import UserError, rng_from_state, rng_state
 
 ROOT_LIMIT = 0.30  # m  [Reda23 §3.6]; ASSUMED in 3-D
@@ -346,6 +348,7 @@ class Env:
     """
 
     ENDS = ("fall", "far", "bad", "time", "clip")  # why an episode ends: three failures, two truncations
+    TERMS = TERMS  # of the reward
 
     def __init__(
         self,
@@ -362,6 +365,7 @@ class Env:
         asymmetric=True,
     ):
         self.char, self.ref, self.n, self.horizon, self.substeps = char, ref, n, horizon, substeps
+        self.name, self.training = char.name, char.training
         self.disturbance = disturbance
         self.dt = 1.0 / ref.rate
         self.autoreset = autoreset
@@ -399,6 +403,14 @@ class Env:
         self.balance = balance
         self.failed = np.full(len(ref.first), 0.5)  # `balance`: of each sequence, failures and steps lived, of late
         self.lived = np.full(len(ref.first), float(horizon))
+
+    def value_scale(self, gamma):
+        """The largest return, which makes a critic's output of order 1.  Test: tests/test_gym_env.py::test_interface"""
+        return sum(self.char.reward[t][0] for t in TERMS) / max(1.0 - gamma, 1e-3)
+
+    def stats(self) -> dict:
+        """What else a line of progress should tell: nothing.  Test: tests/test_gym_env.py::test_interface"""
+        return {}
 
     # ---- reset
 
@@ -657,3 +669,26 @@ class Env:
         self.refresh()
         self._observe(slice(None))
         return self.full[:, : self.obs_size], {"critic": self.full}
+
+
+# ------------------------------------------------------------------------------------ Gymnasium
+
+
+def as_gymnasium(char="jesse", ref: Reference | None = None, n: int | None = None, **settings):
+    """This environment with Gymnasium's interface (extra `gym`): `gym_env.OneCharacter`, or `gym_env.Characters`.
+
+    Args      char : a Character, or what `character.load` takes; ref : the motions, the built-in ones by default
+              n : None for one character, a gymnasium.Env; a number for as many, a gymnasium.vector.VectorEnv
+              settings : of `Env`: seed, threads, horizon, substeps, disturbance, balance, asymmetric
+    Raises    UserError: gymnasium is not installed, or no such character
+    Test      tests/test_gym_env.py::test_check_env, test_vector_is_the_environment
+    """
+    import gym_env
+
+    if not isinstance(char, Character):
+        char = load(char)
+    if ref is None:
+        ref = reference(char, mocap.sequences("builtin", "train"))
+    if n is None:
+        return gym_env.OneCharacter(char, ref, **settings)
+    return gym_env.Characters(char, ref, n, **settings)

@@ -4,6 +4,7 @@ r"""Proximal policy optimisation, every gradient by hand  [Reda23 §3.1, §3.7, 
     python ppo.py --character jesse --motion FOLDER --out runs/a       learn on motion capture
     python ppo.py --resume --out runs/a --steps 20e6                   continue exactly where it stopped
     python ppo.py --ship characters/jesse.npz --out runs/a             write the policy of a run, without the rest
+    python ppo.py --gym HalfCheetah-v4                                 learn another's task, with CleanRL's settings
 
 One update:  collect `horizon` steps of `envs` characters with the present policy  ->  values, advantages (gae)  ->
 `epochs` passes over the samples in minibatches of the clipped loss (policy) and the squared error (value).
@@ -27,19 +28,10 @@ import numpy as np
 import character
 import mocap
 import retarget
-from character import TERMS
-from env import (
-    EPISODE_STEPS,
-    SENSORS,
-    TRACK,
-    WITHOUT,
-    Disturbance,
-    Env,
-    ablated,
-    headset_only,
-    input_names,
-)
+from env import EPISODE_STEPS, SENSORS, TRACK, WITHOUT, Disturbance, Env, ablated, headset_only, input_names
+from gym_env import Task, character_only, with_defaults_of_cleanrl
 from nn import (
+    ACTIVATIONS,
     MLP,
     Adam,
     RunningNorm,
@@ -137,6 +129,16 @@ class Options(character.Switches):
         check=(lambda v: set(v) <= set(WITHOUT), f"one or several of {', '.join(WITHOUT)}"), metavar="NAME,…",
     )  # fmt: skip
     track: str = arg("all", "what it imitates of the kinematic pose [§3.5.1]: all, or the root's place", choices=TRACK)
+    gym: str | None = arg(None, "a continuous task of Gymnasium's instead; the defaults are then CleanRL's")
+    activation: str = arg("leaky_relu", "of the hidden layers", choices=tuple(ACTIVATIONS))
+    schedule: str = arg("kl", "learning rates: by --target-kl, or linear, to 0 at --steps", choices=("kl", "linear"))
+    adam_eps: float = arg(1e-8, "epsilon of Adam", check=POSITIVE)
+    value_clip: bool = arg(False, "clip the value's change, too, by --clip-eps")
+    joint_clip: float | None = arg(None, "clip both gradients by one norm, the value's times this", check=POSITIVE)
+    standardise_minibatch: bool = arg(False, "standardise the advantages of each minibatch, not of all samples at once")
+    norm_each_step: bool = arg(False, "the normaliser of the inputs learns every step, not between updates")
+    reward_norm: bool = arg(False, "with --gym: rewards divided by the spread of the running return, clipped at 10")
+    limit_ends: bool = arg(False, "with --gym: a time limit counts as a failure, as in CleanRL: no bootstrap")
 
 
 # ------------------------------------------------------------------------------------ Appendix B
@@ -215,15 +217,22 @@ def policy_loss(policy: Policy, x, action, logp_old, adv, eps):
     return loss, np.concatenate([dtheta, dlog_std.astype(dtheta.dtype)]), {"mu": mu, "ratio": ratio}
 
 
-def critic_loss(policy: Policy, x, target):
+def critic_loss(policy: Policy, x, target, old=None, eps=None):
     r"""½ mean (V(o) − target)² and its gradient  [Reda23 App. B, "supervised learning"].
 
-    Args      x (B, critic), normalised; target (B,), in units of policy.value_scale
+    Departs   with old and eps (`--value-clip`) ½ mean max((V − target)², (clip(V, old ± eps) − target)²), which stops
+              where V has gone far enough towards the target; most PPO code has it, the paper has not
+    Args      x (B, critic), normalised; target, old (B,), in units of policy.value_scale
     Returns   loss : float; gradient (P,)
-    Test      tests/test_ppo.py::test_critic_loss_gradient
+    Test      tests/test_ppo.py::test_critic_loss_gradient, test_value_clip_gradient
     """
     v, cache = policy.critic.forward(x)
-    loss, dv = value_loss(v[:, 0], target)
+    if old is None:
+        loss, dv = value_loss(v[:, 0], target)
+    else:
+        free, held = v[:, 0] - target, np.clip(v[:, 0], old - eps, old + eps) - target
+        loss = 0.5 * float(np.mean(np.maximum(free**2, held**2)))
+        dv = np.where(free**2 >= held**2, free / len(free), 0.0).astype(v.dtype)
     _, dtheta = policy.critic.backward(dv[:, None], cache, want_dx=False)
     return loss, dtheta
 
@@ -249,13 +258,15 @@ class Policy:
     """
 
     def __init__(
-        self, obs_size, critic_size, action_size, hidden, value_hidden, sigma, value_scale, rng, dtype=np.float32
-    ):
+        self, obs_size, critic_size, action_size, hidden, value_hidden, sigma, value_scale, rng, dtype=np.float32,
+        activation="leaky_relu",
+    ):  # fmt: skip
         self.obs_size, self.critic_size, self.action_size = obs_size, critic_size, action_size
         self.value_scale = value_scale
         self.hidden, self.value_hidden = tuple(hidden), tuple(value_hidden)
-        self.actor = MLP((obs_size, *hidden, action_size), rng=rng, gain=0.01, dtype=dtype)
-        self.critic = MLP((critic_size, *value_hidden, 1), rng=rng, gain=1.0, dtype=dtype)
+        self.activation = activation
+        self.actor = MLP((obs_size, *hidden, action_size), activation, rng, gain=0.01, dtype=dtype)
+        self.critic = MLP((critic_size, *value_hidden, 1), activation, rng, gain=1.0, dtype=dtype)
         log_std = np.full(action_size, np.log(sigma), dtype)
         self.theta_pi = np.concatenate([self.actor.theta, log_std])
         self.actor.theta = self.theta_pi[: self.actor.n_params]
@@ -286,6 +297,7 @@ class Policy:
             "hidden": list(self.hidden),
             "value_hidden": list(self.value_hidden),
             "value_scale": self.value_scale,
+            "activation": self.activation,
         }
 
     def load(self, arrays):
@@ -313,7 +325,7 @@ class Policy:
         Test      tests/test_ppo.py::test_init_headset_only, test_init_of_another_character"""
         inputs, outputs = np.asarray(inputs), np.asarray(outputs)
         sizes = obs_size, len(inputs), len(outputs), self.hidden, self.value_hidden
-        out = Policy(*sizes, 1.0, self.value_scale, np.random.default_rng(0), self.theta_pi.dtype)
+        out = Policy(*sizes, 1.0, self.value_scale, np.random.default_rng(0), self.theta_pi.dtype, self.activation)
         for mine, its, rows in ((self.actor, out.actor, inputs[:obs_size]), (self.critic, out.critic, inputs)):
             last = mine.n_layers - 1
             for name, value in mine.params.items():
@@ -336,6 +348,8 @@ class Policy:
         Raises    UserError, naming path: another depth, a wider layer, or another critic's observation
         Test      tests/test_ppo.py::test_init_widens, test_init_symmetric"""
         anew = self.critic_size == self.obs_size < other.critic_size
+        if other.activation != self.activation:
+            raise UserError(f"{path}: its hidden layers are {other.activation}: give --activation {other.activation}")
         try:
             actor = widened(other.actor, self.actor.sizes, rng)
             critic = self.critic if anew else widened(other.critic, self.critic.sizes, rng)
@@ -378,7 +392,9 @@ def load_policy(path) -> tuple[Policy, dict]:
 
 def _checked_shape(shape, arrays) -> dict:
     """The networks' sizes, if the arrays have them: nothing is made that the file does not hold.  ValueError if not"""
-    shape = dict(shape)
+    shape = {"activation": "leaky_relu"} | dict(shape)
+    if shape["activation"] not in ACTIVATIONS:
+        raise ValueError(f"activation {str(shape['activation'])[:80]!r}, valid: {', '.join(ACTIVATIONS)}")
     layers = {k: [shape[f"{k}_size"], *shape[h]] for k, h in (("obs", "hidden"), ("critic", "value_hidden"))}
     layers = {"policy.pi": [*layers["obs"], shape["action_size"]], "policy.critic": [*layers["critic"], 1]}
     for name, sizes in layers.items():
@@ -422,7 +438,7 @@ def check_fits(policy: Policy, env: Env, path):
     if have != need:
         raise UserError(
             f"{path}: a policy of {have[0]} observations and {have[1]} actions; "
-            f"{env.char.name} needs {need[0]} and {need[1]}: use the character it was trained for"
+            f"{env.name} needs {need[0]} and {need[1]}: use the character it was trained for"
         )
 
 
@@ -435,18 +451,17 @@ class Trainer:
     Test      tests/test_ppo.py::test_resume_is_exact, test_learns, test_non_finite_state_does_not_reach_the_networks
     """
 
-    def __init__(self, opt: Options, env: Env):
-        noise = {k: v for k, v in (NOISE | env.char.training).items() if getattr(opt, k) is None}
+    def __init__(self, opt: Options, env: Env | Task):
+        noise = {k: v for k, v in (NOISE | env.training).items() if getattr(opt, k) is None}
         self.opt, self.env = (opt := replace(opt, **noise)), env
         self.rng = np.random.default_rng([opt.seed, 1])
-        weights = sum(env.char.reward[t][0] for t in TERMS)
-        scale = weights / max(1.0 - opt.gamma, 1e-3)  # the largest return
         sizes = (env.obs_size, env.critic_size, env.action_size)
         self.policy = Policy(
-            *sizes, opt.hidden, opt.value_hidden, opt.sigma, scale, np.random.default_rng([opt.seed, 2])
-        )
-        self.adam_pi = Adam(self.policy.theta_pi.size, opt.lr)
-        self.adam_v = Adam(self.policy.critic.theta.size, opt.value_lr)
+            *sizes, opt.hidden, opt.value_hidden, opt.sigma, env.value_scale(opt.gamma),
+            np.random.default_rng([opt.seed, 2]), activation=opt.activation,
+        )  # fmt: skip
+        self.adam_pi = Adam(self.policy.theta_pi.size, opt.lr, eps=opt.adam_eps)
+        self.adam_v = Adam(self.policy.critic.theta.size, opt.value_lr, eps=opt.adam_eps)
         self.steps = self.updates = 0
         t, n = opt.horizon, env.n
         self.x = np.zeros((t, n, env.critic_size), np.float32)  # normalised observations
@@ -469,7 +484,7 @@ class Trainer:
         """
         env, policy, norm = self.env, self.policy, self.policy.norm
         finals = []  # (t, ids, rows): observations at truncations, before the reset
-        sums = dict.fromkeys(TERMS, 0.0)
+        sums = dict.fromkeys(env.TERMS, 0.0)
         ends = dict.fromkeys(env.ENDS, 0)
         lengths, shares = [], []
         sigma = np.exp(policy.log_std)
@@ -479,13 +494,15 @@ class Trainer:
             mu = policy.actor(x[:, : env.obs_size])
             noise = self.rng.standard_normal(mu.shape, dtype=np.float32)
             a = mu + sigma * noise
-            self.mu[t], self.action[t], self.logp[t] = mu, a, gaussian_logp(a, mu, policy.log_std)
+            self.mu[t], self.action[t] = mu, a
             _, r, terminated, truncated, info = env.step(a)
             self.reward[t], self.terminated[t], self.truncated[t] = r, terminated, truncated
+            if self.opt.norm_each_step:
+                norm.update(env.full)
             if truncated.any():
                 ids = np.flatnonzero(truncated)
                 finals.append((t, ids, norm.normalise(info["final_critic"][ids])))
-            for name in TERMS:
+            for name in sums:
                 sums[name] += info["terms"][name].mean()
             for name in ends:
                 ends[name] += int(info["ends"][name].sum())
@@ -493,19 +510,21 @@ class Trainer:
             lengths.append(info["length"][done])
             shares.append((info["length"] / info["available"])[done])
         self.steps += self.opt.horizon * env.n
+        flat = (-1, env.action_size)
+        logp = gaussian_logp(self.action.reshape(flat), self.mu.reshape(flat), policy.log_std)
+        self.logp[:] = logp.reshape(self.logp.shape)
         self._values(finals)
         lengths, shares = np.concatenate(lengths), np.concatenate(shares)
-        failures = ends["fall"] + ends["far"] + ends["bad"]
         seconds = self.opt.horizon * env.n * env.dt
         stats = dict(
             episodes=len(lengths),
             length=float(lengths.mean()) if len(lengths) else float("nan"),
             survival=float(shares.mean()) if len(shares) else float("nan"),
-            time_to_failure=seconds / max(failures, 1),
+            time_to_failure=seconds / max(int(self.terminated.sum()), 1),
             reward=float(self.reward.mean()),
         )
         stats |= {f"r_{k}": v / self.opt.horizon for k, v in sums.items()}
-        return stats | {f"end_{k}": v for k, v in ends.items()}
+        return stats | {f"end_{k}": v for k, v in ends.items()} | env.stats()
 
     def _values(self, finals):
         """V(o_t) and V(o_{t+1}) of everything collected, with the old network.
@@ -524,15 +543,21 @@ class Trainer:
     def update(self) -> dict:
         """Several epochs of minibatches of the two losses; then the learning rate follows the KL divergence.
 
-        Test      tests/test_ppo.py::test_update_improves_both_losses, test_rate_follows_kl_and_sigma_has_a_floor
+        Test      tests/test_ppo.py::test_update_improves_both_losses, test_rate_follows_kl_and_sigma_has_a_floor,
+                  test_linear_schedule, test_joint_clip
         """
         opt, policy = self.opt, self.policy
+        follows_kl = opt.schedule == "kl"
+        if not follows_kl:  # linear
+            left = max(1.0 - (self.steps - self.reward.size) / opt.steps, 0.0)
+            self.adam_pi.lr, self.adam_v.lr = left * opt.lr, left * opt.value_lr
         done = self.terminated | self.truncated
         advantage, target = gae(self.reward, self.old_value, self.next_value, done, opt.gamma, opt.lam)
         variance = explained_variance(self.old_value, target)
         flat = lambda v: v.reshape(-1, *v.shape[2:])  # noqa: E731
         x, action, mu, logp = flat(self.x), flat(self.action), flat(self.mu), flat(self.logp)
-        adv = standardise(advantage).ravel().astype(np.float32)
+        adv = (advantage if opt.standardise_minibatch else standardise(advantage)).ravel().astype(np.float32)
+        old_value = (self.old_value / policy.value_scale).ravel().astype(np.float32)
         target = (target / policy.value_scale).ravel().astype(np.float32)
         old_std = policy.log_std.copy()
         samples = len(adv)
@@ -542,28 +567,36 @@ class Trainer:
             kls = []
             for start in range(0, samples, opt.minibatch):
                 rows = order[start : start + opt.minibatch]
-                xb = x[rows]
+                xb, advb = x[rows], standardise(adv[rows]) if opt.standardise_minibatch else adv[rows]
                 loss, grad, out = policy_loss(
-                    policy, xb[:, : policy.obs_size], action[rows], logp[rows], adv[rows], opt.clip_eps
+                    policy, xb[:, : policy.obs_size], action[rows], logp[rows], advb, opt.clip_eps
                 )
-                clip_grad_norm(grad, opt.max_grad_norm)
+                old = (old_value[rows], opt.clip_eps) if opt.value_clip else ()
+                v_loss, v_grad = critic_loss(policy, xb, target[rows], *old)
+                if opt.joint_clip:
+                    both = np.concatenate([grad, opt.joint_clip * v_grad])
+                    clip_grad_norm(both, opt.max_grad_norm)
+                    grad, v_grad = np.split(both, [len(grad)])
+                else:
+                    clip_grad_norm(grad, opt.max_grad_norm)
+                    clip_grad_norm(v_grad, opt.max_grad_norm)
                 kls.append(gaussian_kl(mu[rows], old_std, out["mu"], policy.log_std))
                 self.adam_pi.step(policy.theta_pi, grad)
                 np.maximum(policy.log_std, np.log(opt.min_sigma), out=policy.log_std)
-                v_loss, v_grad = critic_loss(policy, xb, target[rows])
-                clip_grad_norm(v_grad, opt.max_grad_norm)
                 self.adam_v.step(policy.critic.theta, v_grad)
                 clipped.append(float(np.mean(np.abs(out["ratio"] - 1.0) > opt.clip_eps)))
                 pi_losses.append(loss), v_losses.append(v_loss)
             kl = float(np.mean(kls))
-            if kl > 2.0 * opt.target_kl:  # ASSUMED: leave the samples before they no longer describe the policy
+            # ASSUMED: leave the samples before they no longer describe the policy
+            if follows_kl and kl > 2.0 * opt.target_kl:
                 break
         # ASSUMED: the step size follows the KL divergence of the last epoch
-        if kl > 1.3 * opt.target_kl:
+        if follows_kl and kl > 1.3 * opt.target_kl:
             self.adam_pi.lr = max(self.adam_pi.lr / 1.2, 1e-6)
-        elif kl < opt.target_kl / 1.3:
+        elif follows_kl and kl < opt.target_kl / 1.3:
             self.adam_pi.lr = min(self.adam_pi.lr * 1.2, 1e-2)
-        policy.norm.update(self.raw)
+        if not opt.norm_each_step:
+            policy.norm.update(self.raw)
         self.updates += 1
         return dict(
             kl=kl,
@@ -630,11 +663,16 @@ def fingerprint(ref) -> str:
     return hashlib.sha256(np.ascontiguousarray(ref.qpos)).hexdigest()[:16]
 
 
-def make_env(opt: Options) -> Env:
-    """Character, stitched training sequences, augmented if asked for, environment.
+def make_env(opt: Options) -> Env | Task:
+    """Character, stitched training sequences, augmented if asked for, environment.  Or Gymnasium's task.
 
-    Test      tests/test_ppo.py::test_make_env_augments
+    Test      tests/test_ppo.py::test_make_env_augments, tests/test_gym_env.py::test_wrong_tasks
     """
+    if opt.gym:
+        character_only(opt, Options())
+        return Task(opt.gym, opt.envs, opt.seed, opt.gamma, opt.reward_norm, opt.limit_ends)
+    if opt.reward_norm or opt.limit_ends:
+        raise UserError("--reward-norm and --limit-ends are of tasks: give --gym, or leave them out")
     char = ablated(opt.load(), opt.without, opt.track)
     clips = mocap.sequences(opt.motion, "train", opt.clips, seed=opt.seed, reading=Reading.of(opt))
     if opt.augment:
@@ -656,6 +694,9 @@ def initial_policy(path, env: Env, sigma) -> Policy:
     Raises    UserError: it does not fit; it knows the headset alone and the run has controllers
     Test      tests/test_ppo.py::test_init_headset_only, test_init_of_another_character, test_init_of_a_variation"""
     policy, meta = load_policy(path)
+    if isinstance(env, Task):
+        check_fits(policy, env, path)
+        return policy
     trained = sensors_of(meta, path)
     if trained == "hmd" and env.devices == 3:
         raise UserError(f"{path}: was trained with the headset alone: give --sensors hmd")
@@ -771,12 +812,14 @@ def train(opt: Options) -> Trainer:
         policy = initial_policy(opt.init, env, opt.sigma)
         trainer.policy.begin_from(policy, opt.init, np.random.default_rng([opt.seed, 4]))
         np.maximum(trainer.policy.log_std, np.log(opt.min_sigma), out=trainer.policy.log_std)
-    data = {"fingerprint": fingerprint(env.ref), "sequences": len(env.ref.names), "minutes": len(env.ref) * env.dt / 60}
+    data = env.data() if opt.gym else {
+        "fingerprint": fingerprint(env.ref), "sequences": len(env.ref.names), "minutes": len(env.ref) * env.dt / 60
+    }  # fmt: skip
     before = loaded[1].get("data", data) if loaded else data
     if not isinstance(before, dict) or before.get("fingerprint") != data["fingerprint"]:
         raise UserError(
-            f"{out}: the motions have changed since the run began ({before} against {data}); "
-            f"start a new run with --init {out}"
+            f"{out}: the {'task has' if opt.gym else 'motions have'} changed since the run began "
+            f"({before} against {data}); start a new run with --init {out}"
         )
     if loaded:
         trainer.restore(*loaded, out / CHECKPOINT)
@@ -787,8 +830,8 @@ def train(opt: Options) -> Trainer:
     meta = {"options": asdict(opt), "data": data}
     progress = Progress(opt.steps, trainer.steps)
     print(
-        f"{env.char.name}: {env.obs_size} observations ({env.critic_size} for the critic), {env.action_size} torques, "
-        f"{len(env.ref.names)} sequences, {data['minutes']:.1f} min; policy {trainer.policy.actor.n_params:,} and "
+        f"{env.name}: {env.obs_size} observations ({env.critic_size} for the critic), {env.action_size} actions, "
+        f"{data['sequences']} sequences, {data['minutes']:.1f} min; policy {trainer.policy.actor.n_params:,} and "
         f"critic {trainer.policy.critic.n_params:,} weights; ready in {time.perf_counter() - began:.1f} s"
     )
     saved = time.perf_counter()
@@ -814,9 +857,10 @@ def train(opt: Options) -> Trainer:
 
 def progress_line(s) -> dict:
     """The numbers a watcher needs, short."""
-    terms = " ".join(f"{t} {s[f'r_{t}']:.2f}" for t in TERMS if s[f"r_{t}"])
-    ends = " ".join(f"{e} {s[f'end_{e}']}" for e in Env.ENDS if s[f"end_{e}"])
-    return {
+    terms = " ".join(f"{k[2:]} {v:.2f}" for k, v in s.items() if k.startswith("r_") and v)
+    ends = " ".join(f"{k[4:]} {v}" for k, v in s.items() if k.startswith("end_") and v)
+    known = {"return of 100": f"{s['return_100']:.0f}"} if "return_100" in s else {}
+    return known | {
         "steps/s": f"{s['steps_per_s']:.0f}",
         "fails every": f"{s['time_to_failure']:.2f} s",
         "survival": f"{s['survival']:.2f}",
@@ -832,8 +876,9 @@ def progress_line(s) -> dict:
 
 def main(argv=None):
     """python ppo.py: train, or resume.  Test: tests/test_cli.py::test_ppo"""
-    opt = cli(Options, argv, "ppo.py", __doc__)
-    opt = replace(opt, out=opt.out or f"runs/{Path(opt.character).stem}")
+    of_gym = any(a.split("=")[0] == "--gym" for a in argv)
+    opt = cli(with_defaults_of_cleanrl(Options) if of_gym else Options, argv, "ppo.py", __doc__)
+    opt = replace(opt, out=opt.out or f"runs/{Path(opt.gym or opt.character).stem}")
     if opt.ship:
         meta = ship(opt.out, opt.ship)
         print(f"{opt.ship}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}; {meta['licence']}")

@@ -1,15 +1,20 @@
 """bench.py: the figures exist, are rates, and the parts cost less than the whole."""
 
 import json
+import sys
 
 import mujoco
 import numpy as np
+import pytest
 
 import bench
 import character
+import gym_env
 import mocap
+import ppo
 import retarget
 from env import Env
+from runs import UserError
 
 
 def test_bench_json(tmp_path, capsys):
@@ -86,3 +91,50 @@ def test_bench_skeletal(tmp_path, capsys, monkeypatch):
     step = bench.SkeletalStep(2, np.random.default_rng(0))
     first = step()
     assert min(step() for _ in range(3)) < first
+
+
+def test_torch_updates_as_we_do():
+    """The twin that is timed ends with the same weights."""
+    pytest.importorskip("torch", reason="torch is not installed (extra torch)")
+    char = character.load("jesse")
+    ref = retarget.reference(char, [mocap.load("builtin", clips="stand_007")[0][:60]])
+    small = dict(envs=8, horizon=8, minibatch=20, hidden=(12,), value_hidden=(10, 8), epochs=3, threads=1)
+    opt = ppo.Options(**small, schedule="linear", lr=1e-2)
+    trainer = ppo.Trainer(opt, Env(char, ref, 8, threads=1))
+    trainer.start()
+    trainer.collect()
+    before, update = trainer.policy.arrays(), bench.torch_update(trainer)
+    theirs = update()
+    np.testing.assert_array_equal(trainer.policy.theta_pi, before["policy.pi"])  # ours are left alone
+    trainer.update()
+    for mine, its, old in zip(
+        (trainer.policy.theta_pi, trainer.policy.critic.theta), theirs, (before["policy.pi"], before["policy.critic"])
+    ):
+        assert np.abs(mine - old).max() > 5e-3
+        np.testing.assert_allclose(its, mine, atol=2e-4)
+
+
+def test_bench_peers(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed (extra peers)")
+    monkeypatch.setattr(mocap, "sequences", lambda *_: [mocap.load("builtin", clips="stand_007")[0][:60]])
+    out = tmp_path / "bench.json"
+    small = "--envs", "8", "--processes", "2", "--rounds", "2", "--threads", "1"
+    bench.main(["--peers", *small, "--json", str(out)])
+    r = json.loads(out.read_text())["peers"]
+    assert {"ours", "sb3_batched", "sb3_subproc", "torch_update_ratio"} <= set(r)
+    assert set(r["cpu_s"]) == {"ours", "update", "torch", "sb3_batched"}
+    assert min(v for k, v in r.items() if k != "cpu_s") > 0 < min(r["cpu_s"].values())
+    assert r["cpu_s"]["update"] < r["cpu_s"]["ours"]
+    for k in ("sb3_batched", "sb3_subproc"):  # medians of two: a ratio of means and a mean of ratios
+        assert r[f"ours_of_{k}"] == pytest.approx(r["ours"] / r[k], rel=0.5)
+    assert f"{r['sb3_subproc']:,.0f}" in capsys.readouterr().out
+
+
+def test_peers_without_stable_baselines(monkeypatch):
+    for name in ("stable_baselines3", "stable_baselines3.common.vec_env"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(UserError, match="peers"):
+        bench.bench_peers(None, None, bench.Options())
+    gym_env._vec_env.cache_clear()
+    with pytest.raises(UserError, match="peers"):
+        gym_env.as_sb3(None)

@@ -8,7 +8,6 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -242,6 +241,28 @@ def test_critic_loss_gradient():
     np.testing.assert_allclose(policy.value(x, rows=7), 3.0 * policy.critic(x)[:, 0])  # value_scale; in pieces
 
 
+def test_value_clip_gradient():
+    """½ mean of the larger square; no gradient once V has left old ± ε towards the target."""
+    policy, x, *_, target = policy_batch()
+    v, rng = policy.critic(x)[:, 0], np.random.default_rng(0)
+    old = v + rng.choice([-0.5, -0.1, 0.1, 0.5], len(v))
+    loss, gradient = ppo.critic_loss(policy, x, target, old, 0.2)
+    slow, kinds = 0.0, set()
+    for i in range(len(v)):
+        held = min(max(v[i], old[i] - 0.2), old[i] + 0.2)
+        slow += max((v[i] - target[i]) ** 2, (held - target[i]) ** 2) / (2 * len(v))
+        kinds.add((held == v[i], (held - target[i]) ** 2 > (v[i] - target[i]) ** 2))
+    assert kinds == {(True, False), (False, False), (False, True)}
+    assert loss == pytest.approx(slow, rel=1e-12) and loss > ppo.critic_loss(policy, x, target)[0]
+    theta = policy.critic.theta.copy()
+
+    def f(u):
+        policy.critic.theta[:] = u
+        return ppo.critic_loss(policy, x, target, old, 0.2)[0]
+
+    check_gradient(f, theta, gradient, rtol=1e-6, atol=1e-9)
+
+
 # ------------------------------------------------------------------------------------ what is collected
 
 
@@ -347,17 +368,45 @@ def test_rate_follows_kl_and_sigma_has_a_floor(char, ref):
     assert t.adam_pi.lr == pytest.approx(1e-4 * 1.2)
 
 
+def test_linear_schedule(char, ref):
+    """Both learning rates fall to 0 at --steps, whatever the KL divergence; no epoch is left out for it."""
+    t = trainer_of(char, ref, schedule="linear", steps=48 * 4, target_kl=1e-6, lr=1e-2, value_lr=2e-2)
+    rates, per_update = [], 4 * 3  # epochs × minibatches
+    for k in range(4):
+        t.collect(), t.update()
+        rates.append((t.adam_pi.lr, t.adam_v.lr))
+        assert t.adam_pi.t == per_update * (k + 1)
+    np.testing.assert_allclose(rates, [(1e-2 * s, 2e-2 * s) for s in (1.0, 0.75, 0.5, 0.25)])
+
+
+def test_joint_clip(char, ref, monkeypatch):
+    """One norm over both gradients, the value's weighted; and advantages standardised minibatch by minibatch."""
+    given, seen = [], []
+    monkeypatch.setattr(ppo, "clip_grad_norm", lambda g, m: given.append((g.copy(), m)))
+    loss = ppo.policy_loss
+    monkeypatch.setattr(ppo, "policy_loss", lambda *a: seen.append(a[4]) or loss(*a))
+    sizes = []
+    for more in ({}, {"joint_clip": 0.5, "max_grad_norm": 0.3, "standardise_minibatch": True}):
+        t = trainer_of(char, ref, epochs=1, **more)
+        t.collect()
+        seen.clear(), given.clear()
+        t.update()
+        sizes.append([len(g) for g, _ in given])
+    both = t.policy.theta_pi.size + t.policy.critic.theta.size
+    assert sizes == [[t.policy.theta_pi.size, t.policy.critic.theta.size] * 3, [both] * 3] and given[0][1] == 0.3
+    np.testing.assert_allclose([a.mean() for a in seen], 0.0, atol=1e-6)
+    np.testing.assert_allclose([a.std() for a in seen], 1.0, atol=1e-3)
+
+
 # ------------------------------------------------------------------------------------ learning
 
 
 class Reach:
     """Points on a line, with the interface of Env: go to the target and stay; |x| > 2 fails, 12 steps truncate."""
 
-    ENDS = Env.ENDS
+    ENDS, TERMS, name, training = Env.ENDS, Env.TERMS, "reach", {}
     obs_size, critic_size, action_size, dt = 2, 3, 1, 0.1
-    char = SimpleNamespace(
-        name="reach", training={}, reward={k: (float(k == "q"), 1.0) for k in TERMS} | {"fail": -5.0}
-    )
+    value_scale, stats = (lambda self, gamma: 1.0 / (1.0 - gamma)), (lambda self: {})
 
     def __init__(self, n):
         self.n, self.full = n, np.zeros((n, 3), np.float32)
