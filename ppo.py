@@ -103,7 +103,7 @@ class Options(character.Switches):
     gamma: float = arg(0.97, "discount (QuestSim's)", check=UNIT)
     lam: float = arg(0.95, "lambda of generalised advantage estimation; 1 is Appendix B's return", check=UNIT)
     clip_eps: float = arg(0.2, "epsilon of the clipped loss", check=BELOW_ONE)
-    epochs: int = arg(4, "passes over the samples per update", check=COUNT)
+    epochs: int = arg(2, "passes over the samples per update", check=COUNT)
     minibatch: int = arg(2048, "samples per gradient step", check=COUNT)
     lr: float = arg(1e-4, "policy's learning rate to start from; adapted to --target-kl", check=POSITIVE)
     value_lr: float = arg(1e-3, "value network's learning rate", check=POSITIVE)
