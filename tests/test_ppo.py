@@ -370,7 +370,7 @@ def test_rate_follows_kl_and_sigma_has_a_floor(char, ref):
 
 def test_linear_schedule(char, ref):
     """Both learning rates fall to 0 at --steps, whatever the KL divergence; no epoch is left out for it."""
-    t = trainer_of(char, ref, schedule="linear", steps=48 * 4, target_kl=1e-6, lr=1e-2, value_lr=2e-2)
+    t = trainer_of(char, ref, schedule="linear", epochs=4, steps=48 * 4, target_kl=1e-6, lr=1e-2, value_lr=2e-2)
     rates, per_update = [], 4 * 3  # epochs × minibatches
     for k in range(4):
         t.collect(), t.update()
