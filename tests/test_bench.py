@@ -23,8 +23,8 @@ def test_bench_json(tmp_path, capsys):
     r = json.loads(out.read_text())["characters"]["jesse"]
     needed = "physics environment inference update train policy_step_ms_p50 policy_step_ms_p99 peak_mb".split()
     assert all(r[k] > 0 for k in needed)
-    # one control step of training is one of each part, so it cannot be faster than the slowest of them; medians of three
-    # rounds, of parts timed in turn, scatter by more than inference and update cost on a machine that does other things
+    # one control step of training is one of each part, so it cannot be faster than the slowest of them; the medians of
+    # three rounds scatter by more than inference and update cost on a machine that does other things, too
     assert r["train"] < 1.25 * min(r["environment"], r["inference"], r["update"])
     assert r["policy_step_ms_p50"] <= r["policy_step_ms_p99"]
     printed = capsys.readouterr().out
