@@ -24,7 +24,7 @@ def test_bench_json(tmp_path, capsys):
     needed = "physics environment inference update train policy_step_ms_p50 policy_step_ms_p99 peak_mb".split()
     assert all(r[k] > 0 for k in needed)
     # one control step of training is one of each part, so it cannot be faster than the slowest of them; the
-    # environment is nearly all of it, and is timed apart: that scatters by more than the rest costs where other jobs run
+    # environment is nearly all of it and timed apart, which scatters by more than the rest costs where other jobs run
     assert r["train"] < min(1.25 * r["environment"], r["inference"], r["update"])
     assert r["policy_step_ms_p50"] <= r["policy_step_ms_p99"]
     printed = capsys.readouterr().out
