@@ -810,9 +810,9 @@ def geom_lowest(model, geoms, xpos, xmat):
     Test      tests/test_retarget.py::test_geom_lowest
     """
     kind, size = model.geom_type[geoms], model.geom_size[geoms]
-    box, capsule = kind == mujoco.mjtGeom.mjGEOM_BOX, kind == mujoco.mjtGeom.mjGEOM_CAPSULE
+    box, capsule = kind == int(mujoco.mjtGeom.mjGEOM_BOX), kind == int(mujoco.mjtGeom.mjGEOM_CAPSULE)
     half = np.where(box[:, None], size, 0.0)  # (g, 3) half sizes along the geom's axes, without the radius
-    half[capsule, 2] = size[capsule, 1]
+    half[:, 2] = np.where(capsule, size[:, 1], half[:, 2])
     lowest = xpos[:, geoms, 2] - np.where(box, 0.0, size[:, 0])
     for axis in range(3):
         lowest -= np.abs(xmat[:, geoms, 6 + axis]) * half[:, axis]  # R_zi: height of axis i

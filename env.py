@@ -370,14 +370,7 @@ class Env:
         self.dt = 1.0 / ref.rate
         self.autoreset = autoreset
         char.model.opt.timestep = self.dt / substeps
-        self.batch = char.batch(n, threads)
-        bind = self.batch.bind
-        self.qpos, self.qvel, self.ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
-        self.warmstart = bind("qacc_warmstart")
-        self.xpos, self.xmat, self.xquat = bind("xpos"), bind("xmat"), bind("xquat")
-        self.cvel, self.com, self.sensordata = bind("cvel"), bind("subtree_com"), bind("sensordata")
-        self.geom_xpos, self.geom_xmat = bind("geom_xpos"), bind("geom_xmat")
-        self.disabled = self.batch.expand("opt.disableflags")
+        self.attach(char.batch(n, threads))
         self.devices = ref.sensor_pos.shape[1]  # 1: `headset_only`
         self.asymmetric = asymmetric
         self.terms = observation_terms(char, self.devices, asymmetric)
@@ -403,6 +396,16 @@ class Env:
         self.balance = balance
         self.failed = np.full(len(ref.first), 0.5)  # `balance`: of each sequence, failures and steps lived, of late
         self.lived = np.full(len(ref.first), float(horizon))
+
+    def attach(self, batch):
+        """Where the simulations are: state and kinematics as arrays that share their memory."""
+        self.batch, bind = batch, batch.bind
+        self.qpos, self.qvel, self.ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
+        self.warmstart = bind("qacc_warmstart")
+        self.xpos, self.xmat, self.xquat = bind("xpos"), bind("xmat"), bind("xquat")
+        self.cvel, self.com, self.sensordata = bind("cvel"), bind("subtree_com"), bind("sensordata")
+        self.geom_xpos, self.geom_xmat = bind("geom_xpos"), bind("geom_xmat")
+        self.disabled = self.batch.expand("opt.disableflags")
 
     def value_scale(self, gamma):
         """The largest return, which makes a critic's output of order 1.  Test: tests/test_gym_env.py::test_interface"""
@@ -469,10 +472,10 @@ class Env:
         """Failures and steps lived of each sequence; of the past nine tenths remain with every episode's end.
 
         Test      tests/test_env.py::test_balanced_starts"""
-        for i in done:
-            k = self.sequence[i]
-            self.failed[k] = 0.9 * self.failed[k] + terminated[i]
-            self.lived[k] = 0.9 * self.lived[k] + self.steps[i]
+        k, sequences = self.sequence[done], len(self.failed)
+        kept = 0.9 ** np.bincount(k, minlength=sequences)
+        self.failed[:] = kept * self.failed + np.bincount(k, terminated[done], sequences)
+        self.lived[:] = kept * self.lived + np.bincount(k, self.steps[done], sequences)
 
     # ---- step
 
@@ -584,7 +587,7 @@ class Env:
 
         Test      tests/test_env.py::test_reward_terms, test_zero_weight_adds_nothing"""
         c, ref, f, r = self.char, self.ref, self.frame, self.char.reward
-        links, ends = c.reward_links, [c.root, c.head]
+        links, ends = c.reward_links, np.array([c.root, c.head])
         values = dict(
             q=lambda w, k: reward_q(w, k, self.qpos[:, 7:], ref.qpos[f, 7:], c.joint_weights),
             qd=lambda w, k: reward_qd(w, k, self.qvel[:, 6:], ref.qvel[f, 6:], c.joint_weights),
@@ -632,7 +635,7 @@ class Env:
         n = len(f)
         frame.place(ref.human_pos[f], out[:, s["human_pos"]].reshape(n, 15, 3))
         frame.turn(ref.human_rot[f], out[:, s["human_rot"]].reshape(n, 15, 3, 2))
-        ahead = np.minimum(np.add.outer(f, FUTURES), ref.last[self.sequence[ids]][:, None])  # (n, futures)
+        ahead = np.minimum(f[:, None] + np.array(FUTURES), ref.last[self.sequence[ids]][:, None])  # (n, futures)
         futures = out[:, s["human_rot"].stop :].reshape(n, -1, 3)
         frame.place(ref.human_pos[ahead].reshape(futures.shape), futures)
 

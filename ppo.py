@@ -13,11 +13,14 @@ One update:  collect `horizon` steps of `envs` characters with the present polic
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import signal
 import time
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from statistics import fmean
 
 # OpenBLAS's idle threads spin for 25 ms before they sleep and take the cores from the physics.
 # 2^10 cycles is enough; it must be said before NumPy is loaded.
@@ -26,6 +29,7 @@ os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "10")
 import numpy as np
 
 import character
+import gpu
 import mocap
 import retarget
 from env import EPISODE_STEPS, SENSORS, TRACK, WITHOUT, Disturbance, Env, ablated, headset_only, input_names
@@ -98,6 +102,7 @@ class Options(character.Switches):
     resume: bool = arg(False, "continue the run in --out exactly")
     ship: str | None = arg(None, "write the policy of the run in --out to this .npz, and train nothing")
     init: str | None = arg(None, "start from the weights of a policy (.npz) or a run folder")
+    gpu: bool = arg(False, "train on an NVIDIA GPU (extra gpu); give thousands of --envs")
     threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
     checkpoint_minutes: float = arg(3.0, "minutes between checkpoints", check=NONNEGATIVE)
     gamma: float = arg(0.97, "discount (QuestSim's)", check=UNIT)
@@ -473,7 +478,7 @@ class Trainer:
 
     def start(self):
         """First observation; the normaliser begins with it, or the first update would see unscaled inputs."""
-        self.env.reset(self.opt.seed)
+        self.env.reset(None if self.opt.gpu else self.opt.seed)  # the GPU's random numbers have their seed already
         if self.policy.norm.count == 0:
             self.policy.norm.update(self.env.full)
 
@@ -503,7 +508,7 @@ class Trainer:
                 ids = np.flatnonzero(truncated)
                 finals.append((t, ids, norm.normalise(info["final_critic"][ids])))
             for name in sums:
-                sums[name] += info["terms"][name].mean()
+                sums[name] += float(info["terms"][name].mean())
             for name in ends:
                 ends[name] += int(info["ends"][name].sum())
             done = terminated | truncated
@@ -582,11 +587,11 @@ class Trainer:
                     clip_grad_norm(v_grad, opt.max_grad_norm)
                 kls.append(gaussian_kl(mu[rows], old_std, out["mu"], policy.log_std))
                 self.adam_pi.step(policy.theta_pi, grad)
-                np.maximum(policy.log_std, np.log(opt.min_sigma), out=policy.log_std)
+                np.maximum(policy.log_std, math.log(opt.min_sigma), out=policy.log_std)
                 self.adam_v.step(policy.critic.theta, v_grad)
                 clipped.append(float(np.mean(np.abs(out["ratio"] - 1.0) > opt.clip_eps)))
                 pi_losses.append(loss), v_losses.append(v_loss)
-            kl = float(np.mean(kls))
+            kl = fmean(kls)
             # ASSUMED: leave the samples before they no longer describe the policy
             if follows_kl and kl > 2.0 * opt.target_kl:
                 break
@@ -600,13 +605,13 @@ class Trainer:
         self.updates += 1
         return dict(
             kl=kl,
-            clip_fraction=float(np.mean(clipped)),
+            clip_fraction=fmean(clipped),
             explained_variance=variance,
             lr=self.adam_pi.lr,
             sigma=float(np.exp(policy.log_std).mean()),
             entropy=float(gaussian_entropy(policy.log_std)),
-            policy_loss=float(np.mean(pi_losses)),
-            value_loss=float(np.mean(v_losses)),
+            policy_loss=fmean(pi_losses),
+            value_loss=fmean(v_losses),
             saturation=float(np.mean(np.abs(self.action) > 0.99)),
         )
 
@@ -614,19 +619,15 @@ class Trainer:
 
     def save(self, path, meta):
         """Everything: policy, optimisers, environments, random states."""
+        own = dict(steps=self.steps, updates=self.updates, lr=self.adam_pi.lr, policy=self.policy.shape())
+        if self.opt.gpu:  # the policy alone: --init goes on from it
+            save_checkpoint(path, gpu.fetched(self.policy.arrays()), meta | own)
+            return
         env_arrays, env_meta = self.env.state()
         arrays = self.policy.arrays() | {f"env.{k}": v for k, v in env_arrays.items()}
         for name, adam in (("adam_pi", self.adam_pi), ("adam_v", self.adam_v)):
             arrays |= {f"{name}.{k}": v for k, v in adam.state().items()}
-        own = dict(
-            steps=self.steps,
-            updates=self.updates,
-            lr=self.adam_pi.lr,
-            rng=rng_state(self.rng),
-            env=env_meta,
-            policy=self.policy.shape(),
-        )
-        save_checkpoint(path, arrays, meta | own)
+        save_checkpoint(path, arrays, meta | own | dict(rng=rng_state(self.rng), env=env_meta))
 
     def restore(self, arrays, meta, path="the checkpoint"):
         """Continue bit-exactly from what `save` wrote.  UserError, naming path: something else was saved"""
@@ -801,6 +802,8 @@ class StopFlag:
 def train(opt: Options) -> Trainer:
     """Run, or resume, a training run.  Test: tests/test_ppo.py::test_resume_is_exact, tests/test_cli.py::test_ppo"""
     out = Path(opt.out)
+    if opt.gpu and (opt.gym or opt.resume):
+        raise UserError("--gpu trains a character, and goes on with --init: leave --gym and --resume out")
     loaded = latest_checkpoint(out, FINITE) if opt.resume else None
     began = time.perf_counter()
     check_run(out, opt.resume)
@@ -821,18 +824,27 @@ def train(opt: Options) -> Trainer:
             f"{out}: the {'task has' if opt.gym else 'motions have'} changed since the run began "
             f"({before} against {data}); start a new run with --init {out}"
         )
+    with ExitStack() as stack:
+        if opt.gpu:
+            stack.enter_context(gpu.arrays_of(gpu.moved(trainer)))
+        _loop(trainer, loaded, {"options": asdict(opt), "data": data}, time.perf_counter() - began)
+    return trainer
+
+
+def _loop(trainer: Trainer, loaded, meta, seconds):
+    """Collect and update until --steps or a signal, with checkpoints."""
+    opt, env, data, out = trainer.opt, trainer.env, meta["data"], Path(trainer.opt.out)
     if loaded:
         trainer.restore(*loaded, out / CHECKPOINT)
     else:
         trainer.start()
     open_run(out, asdict(opt) | {"data": data}, opt.resume)
     metrics = Metrics(out / METRICS, loaded[1].get("rows", 0) if loaded else None)
-    meta = {"options": asdict(opt), "data": data}
     progress = Progress(opt.steps, trainer.steps)
     print(
         f"{env.name}: {env.obs_size} observations ({env.critic_size} for the critic), {env.action_size} actions, "
         f"{data['sequences']} sequences, {data['minutes']:.1f} min; policy {trainer.policy.actor.n_params:,} and "
-        f"critic {trainer.policy.critic.n_params:,} weights; ready in {time.perf_counter() - began:.1f} s"
+        f"critic {trainer.policy.critic.n_params:,} weights; ready in {seconds:.1f} s"
     )
     saved = time.perf_counter()
     with StopFlag() as flag:
@@ -851,8 +863,10 @@ def train(opt: Options) -> Trainer:
     trainer.save(out / CHECKPOINT, meta | {"rows": metrics.rows})
     metrics.close()
     if flag.stop:
-        print(f"stopped at {fmt_count(trainer.steps)} steps; continue with: python ppo.py --resume --out {out}")
-    return trainer
+        print(
+            f"stopped at {fmt_count(trainer.steps)} steps; continue with: python ppo.py "
+            + (f"--init {out}" if opt.gpu else f"--resume --out {out}")
+        )
 
 
 def progress_line(s) -> dict:
