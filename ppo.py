@@ -430,7 +430,8 @@ def ship(run, path) -> dict:
         notes[0].read_text(errors="replace").strip().split("\n")[0] if notes else "no licence file beside the motion"
     )
     kept = {k: meta[k] for k in ("policy", "steps", "data")}
-    kept["options"] = meta["options"] | {"motion": Path(motion).name, "out": None, "init": meta["options"]["init"]}
+    init = meta["options"]["init"] and Path(meta["options"]["init"]).name
+    kept["options"] = meta["options"] | {"motion": Path(motion).name, "out": None, "init": init}
     licence = "MIT" if motion == "builtin" else f"weights trained on {Path(motion).name}, licensed: {title}"
     kept |= {"licence": licence, "versions": versions(), "git": git_state()}
     save_checkpoint(path, policy.arrays(), kept)
