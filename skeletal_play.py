@@ -187,7 +187,7 @@ def _pictures(motions, labels, png, video, every):
         p *= 1.0 / m.skeleton.leg  # everybody's legs are 1 m long
         p[..., 1] -= 1.1 * (i - 0.5 * (len(poses) - 1))
     count = min(map(len, poses))
-    camera = lambda t: _camera(np.mean([p[t, :1] for p in poses], axis=0), 2.6 + len(poses))  # noqa: E731
+    camera = lambda t: _camera(np.mean([p[t, :1] for p in poses], axis=0), 3.2 + 0.6 * len(poses))  # noqa: E731
     scene = render.Scene(model, 480, 360, camera(0), fast=True)
 
     def frame(t):
