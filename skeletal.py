@@ -29,7 +29,7 @@ from runs import UserError, run_main
 KERNEL, DISTANCE, SLOPE = 15, 2, 0.2  # [SAN §5.2, published code]
 CHANNELS, STATIC = (8, 16), (6, 12)  # channels an armature after each layer; STATIC is ASSUMED
 BN_EPS = 1e-5
-ROOT = 7  # channels of the root armature: velocity forward and left, height, quaternion
+ROOT, PLACE = 7, 3  # channels of the root armature: velocity forward and left, height; quaternion
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,8 @@ class Choices:
                      over five ends and three axes where [SAN-7] prints a sum: 5000 / 15 = 333.  Ours: 300
     position       : weight of the position part of L_rec against the rotation part, in leg lengths squared (ASSUMED)
     path           : the same of the root's path (ASSUMED)
+    carry_root     : the root's path and height, in legs, go from source to target, as the heading does (Departs);
+                     decoded, as in the paper, a speed wrong by 1 % is already a tenth of a leg off after ten legs
     """
 
     neighbour_mean: bool = False
@@ -54,12 +56,15 @@ class Choices:
     weights: tuple = (5.0, 2.5, 1.0, 300.0)
     position: float = 100.0
     path: float = 2.0
+    carry_root: bool = True
 
 
 CHOICES = {  # by name, for --variant
     "ours": Choices(),
-    "paper": Choices(neighbour_mean=True, weights=(1.0, 1.0, 0.25, 2.0)),
-    "code": Choices(static_scale=0.01, root_ends=False, ee_height=True, weights=(5.0, 2.5, 1.0, 333.0)),
+    "paper": Choices(neighbour_mean=True, weights=(1.0, 1.0, 0.25, 2.0), carry_root=False),
+    "code": Choices(
+        static_scale=0.01, root_ends=False, ee_height=True, weights=(5.0, 2.5, 1.0, 333.0), carry_root=False
+    ),
 }
 
 

@@ -17,6 +17,7 @@ from skeletal import (
     CHANNELS,
     CHOICES,
     DISTANCE,
+    PLACE,
     ROOT,
     SLOPE,
     STATIC,
@@ -309,6 +310,18 @@ class Critic(Network):
         (d, _), grads = conv_backward(pool_backward(leaky_backward(d, a3)[0], a2)[0], a1, want_dx)
         self.add(self.c[0], grads)
         return d
+
+
+def carry_root(y, raw, mean, std):
+    r"""The root's path and height as the source has them, in legs, instead of the decoded ones; in place.
+
+    Equation  y_c = (x_c - mean_c) / std_c, c: velocity forward and left [legs a frame], height [legs]
+    Departs   the paper decodes them (Choices.carry_root)
+    Args      y : (C, T, B) decoded, standardised; raw : (C', T, B) the source's, not standardised; mean, std : the
+              target's, of shapes that broadcast with y
+    Test      tests/test_skeletal_train.py::test_root_is_carried
+    """
+    y[:PLACE] = (raw[:PLACE] - mean[:PLACE]) / std[:PLACE]
 
 
 # ------------------------------------------------------------------------------------ losses

@@ -37,11 +37,11 @@ from runs import (
     save_checkpoint,
     versions,
 )
-from skeletal import CHOICES, fk_forward
+from skeletal import PLACE, ROOT, fk_forward
 from skeletal import fk_backward as fk_grad
 from skeletal_data import Motion, Skeleton
-from skeletal_net import Generator, mse
-from skeletal_train import WINDOW, Domain, base_motions, domains_from, train
+from skeletal_net import Generator, carry_root, mse
+from skeletal_train import WINDOW, Domain, base_motions, choices_of, domains_from, train
 
 SHIPPED = Path(__file__).resolve().parent / "weights" / "skeletal.npz"
 
@@ -66,8 +66,8 @@ class Retargeter:
             arrays, meta = load_checkpoint(path, finite=("generator*",))
         self.meta, self.domains = meta, domains_from(arrays, meta, path)
         rng = np.random.default_rng(0)
-        choices = CHOICES.get(meta.get("variant"), CHOICES["ours"])
-        self.nets = [Generator(d.parents, rng, choices, meta.get("pool", "mean")) for d in self.domains]
+        self.choices = choices_of(meta.get("variant", "ours"), meta.get("root", "decoded"))
+        self.nets = [Generator(d.parents, rng, self.choices, meta.get("pool", "mean")) for d in self.domains]
         for k, net in enumerate(self.nets):
             theta = arrays[f"generator{k}"]
             if theta.shape != net.theta.shape:
@@ -102,6 +102,8 @@ class Retargeter:
         features, _ = H.static_forward(B.static(target)[0][:, None])
         y, _ = H.decode_forward(z, features)
         mean, std = B.statistics_of(target)
+        if self.choices.carry_root:
+            carry_root(y, x.T[..., None], mean[:, None, None], std[:, None, None])
         y = (y[..., 0].T * std + mean)[: len(turn)]
         start = m.pos[0, :2] * (target.leg / m.skeleton.leg)
         return data.from_features(y, turn, target, m.name, start)
@@ -185,13 +187,14 @@ def _pictures(motions, labels, png, video, every):
         p *= 1.0 / m.skeleton.leg  # everybody's legs are 1 m long
         p[..., 1] -= 1.1 * (i - 0.5 * (len(poses) - 1))
     count = min(map(len, poses))
-    scene = render.Scene(model, 480, 360, _camera(poses[0][0]), fast=True)
+    camera = lambda t: _camera(np.mean([p[t, :1] for p in poses], axis=0), 3.2 + 0.6 * len(poses))  # noqa: E731
+    scene = render.Scene(model, 480, 360, camera(0), fast=True)
 
     def frame(t):
         marks = []
         for p, m, c in zip(poses, motions, COLOURS):
             marks += render.stick_figure(p[t], m.skeleton.parents, c, 0.025)
-        return scene.frame(physics, _camera(np.mean([p[t] for p in poses if p.shape == poses[0].shape], axis=0)), marks)
+        return scene.frame(physics, camera(t), marks)
 
     if png:
         times = range(0, count, max(round(every * data.RATE), 1))
@@ -202,10 +205,10 @@ def _pictures(motions, labels, png, video, every):
     scene.close()
 
 
-def _camera(p):
+def _camera(p, distance):
     camera = mujoco.MjvCamera()
     camera.lookat[:] = [*p[0, :2], 0.8]
-    camera.distance, camera.azimuth, camera.elevation = 4.6, 120, -12
+    camera.distance, camera.azimuth, camera.elevation = distance, 120, -12
     return camera
 
 
@@ -224,6 +227,9 @@ class MeasureOptions:
     limit: int = arg(12, "held-out clips at most, evenly chosen", check=COUNT)
     characters: int = arg(2, "unseen characters a structure", check=COUNT)
     seed: int = arg(1, "seed of their proportions")
+    png: str | None = arg(None, "folder for contact sheets of source, result and truth")
+    sheets: int = arg(3, "clips drawn there", check=COUNT)
+    every: float = arg(0.6, "seconds between the pictures of a sheet", check=POSITIVE)
     json: str | None = arg(None, "write the figures here")
 
 
@@ -232,16 +238,19 @@ def measure(argv) -> int:
     opt = cli(MeasureOptions, argv, "skeletal.py measure", MeasureOptions.__doc__)
     nets = {name: Retargeter(name) for name in opt.weights.split(",")}
     cases = held_out(opt, next(iter(nets.values())))
-    results = {"copies": copies(cases)}
+    results = {"copies": copies(cases), "shifted": shifted(cases, next(iter(nets.values())))}
     for how, row in results["copies"].items():
         print(f"copy ({how:6s})  " + "  ".join(f"{k} {v:.3f}" for k, v in row.items()))
+    print("copy in the target's statistics  " + "  ".join(f"{k} {v:.3f}" for k, v in results["shifted"].items()))
     best = {k: min(row[k] for row in results["copies"].values()) for k in ("cross", "intra")}
     for name, net in nets.items():
         row = errors(cases, net)
         row |= {"copy_cross": best["cross"], "copy_intra": best["intra"]}
         results[Path(name).stem if Path(name).suffix else Path(name).name] = row
         print(f"{name}\n  " + "  ".join(f"{k} {v:.3f}" for k, v in row.items()))
-    first = next(v for k, v in results.items() if k != "copies")
+    first = next(v for k, v in results.items() if k not in ("copies", "shifted"))
+    if opt.png:
+        sheets(cases, next(iter(nets.values())), opt)
     if opt.json:
         atomic_write(opt.json, json.dumps(first | {"rows": results, "versions": versions()}, indent=2) + "\n")
     return 0
@@ -282,6 +291,46 @@ def copies(cases) -> dict:
         ]
         out[how] = {k: float(np.mean([v for kind, v in rows if kind == k] or [np.nan])) for k in ("cross", "intra")}
     return out
+
+
+def shifted_copy(net: Retargeter, m: Motion, source, target: Skeleton, to) -> Motion:
+    r"""A copy of rotations in the target's statistics: how far the mean poses alone get, without a network.
+
+    Equation  x_c = (copy_c - mean_c^A) / std_c^A std_c^B + mean_c^B for the root's rotation and for joints that both
+              have, by name; other joints, the root's path and its height as in the copy
+    Args      net : for its statistics; the rest as Retargeter's
+    Test      tests/test_skeletal_play.py::test_shifted_copy
+    """
+    A, B = net.domains[source], net.domains[to]
+    copy = data.copy_rotations(m, target, "global")
+    x, turn = data.features(copy)
+    (mean_a, std_a), (mean_b, std_b) = A.statistics_of(m.skeleton), B.statistics_of(target)
+    at = {n: j for j, n in enumerate(A.names)}
+    pairs = [(slice(PLACE, ROOT),) * 2]
+    pairs += [(slice(3 + 4 * at[n], 7 + 4 * at[n]), slice(3 + 4 * j, 7 + 4 * j))
+              for j, n in enumerate(B.names) if j and at.get(n)]  # fmt: skip
+    for a, b in pairs:
+        x[:, b] = (x[:, b] - mean_a[a]) / std_a[a] * std_b[b] + mean_b[b]
+    return data.from_features(x, turn, target, m.name, copy.pos[0, :2])
+
+
+def shifted(cases, net) -> dict:
+    """Errors x 1000 of `shifted_copy`, cross and intra.  Test: tests/test_skeletal_play.py::test_measure_command"""
+    rows = [(kind, 1e3 * data.error(shifted_copy(net, m, a, true.skeleton, b), true)) for kind, a, m, b, true in cases]
+    return {k: float(np.mean([v for kind, v in rows if kind == k] or [np.nan])) for k in ("cross", "intra")}
+
+
+def sheets(cases, net, opt):
+    """Contact sheets of cross retargetings, evenly chosen: source, result after the clean-up, truth.
+
+    Raises    UserError: no such folder, or no OpenGL
+    Test      tests/test_skeletal_play.py::test_sheets"""
+    cross = [c for c in cases if c[0] == "cross"]
+    for i in np.unique(np.linspace(0, len(cross) - 1, opt.sheets).astype(int)):
+        _, a, m, b, true = cross[i]
+        out = data.clean_feet(net(m, a, true.skeleton, b), data.contacts(m))
+        path = Path(opt.png) / f"{m.name}-{'AB'[a]}{'AB'[b]}.png"
+        _pictures([m, out, true], ["source", "retargeted", "truth"], path, None, opt.every)
 
 
 def errors(cases, net) -> dict:

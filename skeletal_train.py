@@ -38,10 +38,10 @@ from runs import (
     stored_options,
     versions,
 )
-from skeletal import CHOICES, ROOT, Choices, fk_forward
+from skeletal import CHOICES, PLACE, ROOT, Choices, fk_forward
 from skeletal import fk_backward as fk_grad
 from skeletal_data import Skeleton, Structure
-from skeletal_net import Critic, FakePool, Generator, ee_loss, lsgan, ltc_loss, rec_loss
+from skeletal_net import Critic, FakePool, Generator, carry_root, ee_loss, lsgan, ltc_loss, rec_loss
 
 WINDOW, STRIDE = 64, 32  # frames  [SAN, published code]
 MIN_STD = 0.02  # ASSUMED: armatures that hardly move are not blown up
@@ -236,9 +236,19 @@ class TrainOptions:
     intra: float = arg(0.3, "share of the steps that retarget within the structure", check=NONNEGATIVE)
     variant: str = arg("ours", "errata: ours, as printed, or the published code's numbers", choices=tuple(CHOICES))
     pool: str = arg("mean", "skeletal pooling", choices=("mean", "max"))
+    root: str | None = arg(
+        None, "the root's path and height: from the source in legs, or decoded; default: the variant's",
+        choices=("carried", "decoded"),
+    )  # fmt: skip
     without: str | None = arg(None, "leave one loss out", choices=TERMS)
     save_minutes: float = arg(5.0, "minutes between checkpoints", check=POSITIVE)
     seed: int = arg(0, "seed")
+
+
+def choices_of(variant, root=None) -> Choices:
+    """The choices of a variant, its root carried or decoded if that is said.  Test: tests/test_skeletal_train.py::test_root_is_carried"""  # noqa: E501
+    choices = CHOICES[variant]
+    return replace(choices, carry_root=root == "carried") if root else choices
 
 
 class Trainer:
@@ -249,7 +259,7 @@ class Trainer:
 
     def __init__(self, opt: TrainOptions, domains, dtype=np.float32, channels=None):
         self.opt, self.domains, self.step_count = opt, domains, 0
-        self.choices: Choices = CHOICES[opt.variant]
+        self.choices = choices_of(opt.variant, opt.root)
         more = {"channels": channels} if channels else {}
         init = np.random.default_rng([opt.seed, 1])
         same = lambda: np.random.default_rng([opt.seed, 3])  # noqa: E731
@@ -276,18 +286,24 @@ class Trainer:
         s, off, reach, height, mean, std = A.body(who)
         features, static = G.static_forward(s)
         z, encoded = G.encode_forward(x, features)
-        real_bones, real_world, _ = fk_forward(x * std + mean, off, A.parents, turn)
+        raw, carried = x * std + mean, slice(PLACE if self.choices.carry_root else 0)
+        real_bones, real_world, _ = fk_forward(raw, off, A.parents, turn)
         losses, dz, df1, df2 = {}, np.zeros_like(z), np.zeros_like(features[1]), np.zeros_like(features[2])
         if w["rec"]:
             y, decoded = G.decode_forward(z, features)
+            if self.choices.carry_root:
+                carry_root(y, raw, mean, std)
             _, world, kin = fk_forward(y * std + mean, off, A.parents, turn)
             losses["rec"], dy, dworld = rec_loss(y, x, world, real_world, self.choices.position, self.choices.path)
             dy = w["rec"] * (dy + std * fk_grad(None, dworld, kin))
+            dy[carried] = 0.0
             d, df2 = G.decode_backward(dy, decoded)
             dz += d
         s_b, off_b, reach_b, height_b, mean_b, std_b = B.body(targets)
         features_b, static_b = H.static_forward(s_b)
         y, decoded = H.decode_forward(z, features_b)  # [SAN-3]
+        if self.choices.carry_root:
+            carry_root(y, raw, mean_b, std_b)
         bones, world, kin = fk_forward(y * std_b + mean_b, off_b, B.parents, turn)
         dy, df1_b = np.zeros_like(y), np.zeros_like(features_b[1])
         if w["ltc"]:
@@ -309,6 +325,7 @@ class Trainer:
             dworld = w["ee"] * dworld
         if dbones is not None or dworld is not None:
             dy += std_b * fk_grad(dbones, dworld, kin)
+        dy[carried] = 0.0
         d, df2_b = H.decode_backward(dy, decoded)
         dz += d
         H.static_backward(df1_b, df2_b, static_b)
@@ -469,7 +486,8 @@ def train(argv) -> int:
 
     def save():
         meta = {"steps": trainer.step_count, "rows": metrics.rows, "rng": rng_state(trainer.rng)}
-        meta |= {"variant": opt.variant, "pool": opt.pool, "motion": opt.motion, "domains": domain_meta(domains)}
+        meta |= {"variant": opt.variant, "root": "carried" if trainer.choices.carry_root else "decoded"}
+        meta |= {"pool": opt.pool, "motion": opt.motion, "domains": domain_meta(domains)}
         save_checkpoint(out / CHECKPOINT, trainer.arrays(), meta)
 
     last, sums, count = time.monotonic(), {}, 0

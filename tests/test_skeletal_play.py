@@ -85,11 +85,13 @@ def test_ship_and_load(trained, tmp_path):
 
 
 def test_retargeter_any_length(trained):
-    """Whole clips of any length, even shorter than a window; the heading is the source's."""
+    """Whole clips of any length, even shorter than a window; the heading and the path in legs are the source's."""
     net = play.Retargeter(trained / "run")
     m = data.human_motion(CLIPS[0])
     for n in (5, 33, 66):
-        out = net(m[:n], 0, net.domains[1].characters[0], 1)
+        target = net.domains[1].characters[0]
+        out = net(m[:n], 0, target, 1)
+        np.testing.assert_allclose(out.pos / target.leg, m.pos[:n] / m.skeleton.leg, atol=1e-5)
         assert len(out) == n and np.isfinite(out.pos).all()
         np.testing.assert_allclose(np.linalg.norm(out.quat, axis=-1), 1.0)
 
@@ -177,6 +179,33 @@ def test_measure_command(trained, tmp_path, monkeypatch, capsys):
     assert r["copy_cross"] == min(v["cross"] for v in r["rows"]["copies"].values()) > 0
     assert r["cross"] > 10 * r["copy_cross"]  # two steps do not teach anything
     assert r["slide_clean"] < r["slide"] and "copy (names" in capsys.readouterr().out
+
+
+def test_shifted_copy(trained):
+    """With the same statistics on both sides it is the copy; a joint by the equation."""
+    net = play.Retargeter(trained / "run")
+    m, (A, B) = data.human_motion(CLIPS[0]), net.domains
+    same = play.shifted_copy(net, m, 0, m.skeleton, 0)
+    np.testing.assert_allclose(data.pose(same)[0], data.pose(m)[0], atol=1e-4)
+    target, j = B.characters[0], B.names.index(A.names[-1])
+    x, _ = data.features(data.copy_rotations(m, target, "global"))
+    a, b = slice(3 + 4 * (len(A.names) - 1), 7 + 4 * (len(A.names) - 1)), slice(3 + 4 * j, 7 + 4 * j)
+    q = (x[:, b] - A.mean[0, a]) / A.std[0, a] * B.std[0, b] + B.mean[0, b]
+    got = play.shifted_copy(net, m, 0, target, 1)
+    angle = data.quat_mul(data.quat_conj(got.quat[:, j]), q / np.linalg.norm(q, axis=1, keepdims=True))
+    np.testing.assert_allclose(np.abs(angle[:, 0]), 1.0, atol=1e-5)
+    np.testing.assert_allclose(got.pos / target.leg, m.pos / m.skeleton.leg, atol=1e-5)
+
+
+def test_sheets(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(st.mocap, "load", lambda *a, **k: CLIPS[:1])
+    net = play.Retargeter(trained / "run")
+    opt = play.MeasureOptions(png=str(tmp_path), sheets=1, every=1.0)
+    try:
+        play.sheets(play.held_out(opt, net), net, opt)
+    except UserError as e:
+        pytest.skip(f"no software OpenGL: {e}")
+    assert [p.stat().st_size > 5000 for p in tmp_path.glob("*-AB.png")] == [True]
 
 
 def test_noise():

@@ -8,6 +8,7 @@ import skeletal
 import skeletal_data as data
 import skeletal_train as st
 from skeletal_data import Motion, Skeleton
+from skeletal_net import carry_root
 
 NAMES = ("hips", "spine", "chest", "thigh_l", "shin_l", "foot_l", "toe_l", "thigh_r", "shin_r", "foot_r", "toe_r")
 PARENTS = (-1, 0, 1, 0, 3, 4, 5, 0, 7, 8, 9)
@@ -45,10 +46,15 @@ def small_trainer(dtype=np.float32, **settings):
 # ------------------------------------------------------------------------------------ losses and steps
 
 
-@pytest.mark.parametrize("n, without", [(0, None), (1, None), *((1, term) for term in st.TERMS)])
-def test_whole_loss_gradient(n, without):
-    """[SAN-8] of one direction, cross and within, with each loss left out once: both generators' whole gradients."""
-    tr = small_trainer(np.float64, without=without)
+@pytest.mark.parametrize(
+    "n, without, root",
+    [(0, None, "carried"), (0, None, "decoded"), (1, None, "decoded"), (1, None, "carried"),
+     *((1, term, "carried") for term in st.TERMS)],
+)  # fmt: skip
+def test_whole_loss_gradient(n, without, root):
+    """[SAN-8] of one direction, cross and within, with each loss left out once, the root carried or decoded: both
+    generators' whole gradients."""
+    tr = small_trainer(np.float64, without=without, root=root)
     rng = np.random.default_rng(1)
     x, turn, who = tr.domains[0].sample(rng, 2)
     batch = (x.astype(float), turn, who)
@@ -69,6 +75,26 @@ def test_whole_loss_gradient(n, without):
         u = rng.standard_normal(net.theta.shape)
         check_along(net.theta, u, loss, net.grad @ u, 3e-7)
     assert np.any(tr.nets[1].grad) == (n == 1)
+
+
+def test_root_is_carried():
+    """The fake's root moves and stands as the source's, in legs, whatever the decoder says; decoded, it does not."""
+    x, turn, who = small_trainer().domains[0].sample(np.random.default_rng(1), 2)
+    targets, wanted = np.array([0, 1]), None
+    for root in ("carried", "decoded"):
+        tr = small_trainer(root=root)
+        _, (real, _), (fake, _) = tr.direction(0, 1, (x, turn, who), targets)
+        wanted = real[:3]  # row 0 of the bones is the root's velocity and height
+        close = np.abs(fake[:3] - wanted).max() < 1e-5
+        assert close == (root == "carried") == tr.choices.carry_root
+        # The decoder's weights for these channels get no gradient.
+        for net in tr.nets:
+            bias = net.grads[net.d[1]][2]
+            assert np.any(bias[3:]) and np.any(bias[:3]) == (root == "decoded")
+    assert [st.choices_of(v).carry_root for v in ("ours", "paper", "code")] == [True, False, False]
+    y, mean, std = np.zeros((5, 2, 1)), np.arange(5.0)[:, None, None], np.full((5, 1, 1), 2.0)
+    carry_root(y, np.full((4, 2, 1), 6.0), mean, std)
+    np.testing.assert_array_equal(y[:, 0, 0], [3.0, 2.5, 2.0, 0.0, 0.0])
 
 
 def test_step_learns():
