@@ -203,9 +203,7 @@ def _vec_env():
 
         def __init__(self, characters: Characters):
             self.characters, self.began = characters, time.perf_counter()
-            super().__init__(
-                characters.num_envs, characters.single_observation_space, characters.single_action_space
-            )
+            super().__init__(characters.num_envs, characters.single_observation_space, characters.single_action_space)
 
         def reset(self):
             obs, _ = self.characters.reset(seed=self._seeds[0])
