@@ -477,7 +477,7 @@ def constrain(stage, rng):
 
 
 def trip(stage, rng):
-    """§8.2: the left heel of a walker and of a runner held for 1 s from when it swings past the other."""
+    """§8.2: the left heel of a walker and of a runner held for 1 s, caught as it swings up to the other foot."""
     return [_trip(stage, stage.again(), speed) for speed in (1.2, 2.5)]
 
 
@@ -488,8 +488,8 @@ def _trip(stage, rng, speed, hold=30):
     def act(t, state):
         forward = quat_rotate(quat_about(2, heading(state.quat[0])), np.array([1.0, 0, 0]))
         ahead = (state.x[J["ankle_l"]] - state.x[J["ankle_r"]]) @ forward
-        if not held and t > 20 and ahead > -0.05 and state.v[J["ankle_l"]] @ forward > 1.5:
-            held.update(at=state.x[J["ankle_l"]].copy(), t=t)
+        if not held and t > 20 and -0.3 < ahead < 0.05 and state.v[J["ankle_l"]] @ forward > 1.0:
+            held.update(at=state.x[J["ankle_l"]].copy(), t=t, ahead=ahead)
         on = held and t < held["t"] + hold
         ball = [(held["at"], 0.05, (0.9, 0.1, 0.1, 1))] if on else []
         return None, ({"pins": {J["ankle_l"]: held["at"]}} if on else {}), ball
@@ -502,7 +502,10 @@ def _trip(stage, rng, speed, hold=30):
         t, end = held["t"], held["t"] + hold
         moved = max(np.linalg.norm(s[0].x[J["ankle_l"]] - held["at"]) for s in take.states[t:end])
         take.window = (t - 3, t + 61)
-        take.notes["heel held"] = f"from {t * STEP:.1f} s for {hold * STEP:.0f} s, within {100 * moved:.1f} cm"
+        take.notes["heel held"] = (
+            f"from {t * STEP:.1f} s for {hold * STEP:.0f} s, {-100 * held['ahead']:.0f} cm behind the other, "
+            f"within {100 * moved:.1f} cm"
+        )
         take.notes["stumble"] = (
             f"trunk from {np.mean(lean[:t]):.0f} to {max(lean[t : end + 30]):.0f} degrees; {pace_of[:t].mean():.2f} m/s"
             " "

@@ -15,12 +15,13 @@ that nothing fits here; that step is a rag doll's.
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 import drop_vae as vae
-from drop import OFFSETS, PARENTS, PATH, STEP, J, N, align, forward_kinematics, swing_twist
+from drop import OFFSETS, PARENTS, PATH, STEP, J, N, align, forward_kinematics, swing_twist, twists
 from human import heading, quat_conj, quat_mul
 from runs import UserError, load_checkpoint, run_main
 
@@ -79,7 +80,8 @@ class NearestPrior:
     Method    features: 12 joints in the heading frame over the pelvis's place on the floor, and τ times their
               velocities; of the nearest 2 n frames of the set n are drawn; each gives its next frame, turned to the
               character's heading: the root moves as recorded, and the difference between character and recording decays
-              by β a step; heights are counted from the floor under the pelvis
+              by β a step; heights are counted from the floor under the pelvis, and on a slope legs and height follow it
+              (`slope`)
     ASSUMED   τ, β, the joints, the number of principal components searched, `reach`; and that beyond `reach` nothing
               fits and the prior says so with no samples
     Args      clips : list of (x (T, 22, 3), quat (T, 22, 4)) on a floor at z = 0; tau [s]; beta, beta_height [-]: of
@@ -117,7 +119,8 @@ class NearestPrior:
 
     @floor.setter
     def floor(self, plane):
-        self._floor, self._last, self._mode = plane, None, None  # what was found over another floor is void
+        self._floor, self._last, self._mode, self._level = plane, None, None, None  # found over another floor: void
+        self._sloping = plane is not None and plane.normal[2] < 1.0 - 1e-9
 
     def features(self, x, v, quat):
         """(T, 72) features whose distances are RMS metres a joint.  x, v (T, 22, 3), quat (T, 22, 4)."""
@@ -170,6 +173,7 @@ class NearestPrior:
 
     def sample(self, state, n, rng):
         """n of the 2 n nearest transitions, drawn without replacement; without rng the n nearest."""
+        state = self._levelled(state)
         pick, distance = self._nearest(state, 2 * n)
         if distance > self.reach:
             return np.zeros((0, N, 3)), np.zeros((0, N, 4))
@@ -177,16 +181,30 @@ class NearestPrior:
         if rng is not None:
             drawn = rng.choice(pick, len(turn), replace=False)
             turn = rng.normal(0.0, self.spread, len(turn))
-        x, quat = self.follow(state, np.append(pick[0], drawn), np.append(0.0, turn))
+        x, quat = self._sloped(*self.follow(state, np.append(pick[0], drawn), np.append(0.0, turn)))
         self._mode = state, x[0], quat[0]  # the simulator asks for the mode of the same state next
         return x[1:], quat[1:]
 
     def mode(self, state):
         """The nearest transition."""
+        state = self._levelled(state)
         if self._mode is None or self._mode[0] is not state:
-            x, quat = self.follow(state, self._nearest(state, 1)[0][:1])
+            x, quat = self._sloped(*self.follow(state, self._nearest(state, 1)[0][:1]))
             self._mode = state, x[0], quat[0]
         return self._mode[1:]
+
+    def _levelled(self, state):
+        """The state that recordings are compared with: itself, or `level_state` of it, the same object each time."""
+        if not self._sloping:
+            return state
+        if self._level is None or self._level[0] is not state:
+            self._level = state, level_state(self.floor, state)
+        return self._level[1]
+
+    def _sloped(self, x, quat):
+        if self._sloping:
+            x[..., 2] += slope(self.floor, x)
+        return x, quat
 
     def _nearest(self, state, n):
         if self._last is None or self._last[0] is not state or len(self._last[1]) < min(n, len(self.norm)):
@@ -279,6 +297,42 @@ class PoseRange:
         out = PATH @ np.matmul(OFFSETS[1:, None], inside[PARENTS[1:]])[:, 0]
         out, centre = out - out.mean(axis=0), x.mean(axis=0)
         return out @ align(out[None], (x - centre)[None])[0].T + centre
+
+
+ANKLES = [J["ankle_l"], J["ankle_r"]]
+# How far a joint follows the floor's slope: feet wholly, knees half, so that the trunk stays upright.  ASSUMED
+SLOPED = np.zeros(N)
+for _name, _share in (("knee", 0.5), ("ankle", 1.0), ("foot", 1.0)):
+    SLOPED[[J[f"{_name}_l"], J[f"{_name}_r"]]] = _share
+
+
+def slope(floor, x):
+    r"""What a sloping floor adds to the height of each joint of a body on a level one.
+
+    Equation  r_j = −(n_xy · (x_j − x_0)_xy) / n_z, the floor's height under joint j less that under the pelvis;
+              Δz_j = s_j r_j + (1 − s_j) min(r of the ankles, 0), s = SLOPED: the trunk sinks as far as the lower foot
+    ASSUMED   recordings are of level floors; a body on a slope is one on a level floor, its legs sheared
+    Args      floor : Plane; x : (..., 22, 3) [m], of which only x and y are read: the inverse subtracts the same
+    Returns   (..., 22) [m]
+    Test      tests/test_drop.py::test_slope
+    """
+    rise = (x[..., :1, :2] - x[..., :2]) @ floor.normal[:2] / floor.normal[2]
+    low = np.minimum(rise[..., ANKLES].min(axis=-1), 0.0)[..., None]
+    return SLOPED * rise + (1.0 - SLOPED) * low
+
+
+def level_state(floor, state):
+    """The State as it would be on a level floor as high as the slope under the pelvis: `slope` undone, as it was a
+    step ago too; so its velocities do not climb.
+
+    Test: tests/test_drop.py::test_slope"""
+    before = state.x - STEP * state.v
+    rise = [slope(floor, p) + ground(floor, p) for p in (before, state.x)]
+    x, v = state.x.copy(), state.v.copy()
+    x[:, 2] -= slope(floor, x)
+    v[:, 2] -= (rise[1] - rise[0]) / STEP
+    quat = vae.quat_of(swing_twist(x, twists(state.quat))[0])
+    return replace(state, x=x, v=v, quat=quat)
 
 
 def ground(floor, x):

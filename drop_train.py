@@ -52,6 +52,7 @@ from runs import (
 )
 
 NORM_LIMIT = 5e3  # of a gradient: far above a usual one, so that only accidents are cut
+SIZES = ("latent", "hidden", "pose_latent", "pose_hidden")
 COUNT_SHOWN = 25  # rollouts a printed line
 
 
@@ -63,6 +64,7 @@ class Options:
     clips: str = arg("*", "shell pattern on clip names")
     out: str = arg("runs/drop_prior", "run folder")
     resume: bool = arg(False, "continue the run in --out exactly")
+    init: str | None = arg(None, "begin with the networks of this file, at its count of updates; fresh moments")
     updates: int = arg(7_000, "updates of the motion VAE; the pose VAE has half", check=POSITIVE)
     batch: int = arg(192, "transitions an update", check=COUNT)
     rollout: int = arg(8, "frames K of a rollout, an update each", check=COUNT)
@@ -245,6 +247,22 @@ class Trainer:
             self.adam[name].lr = lr
             self.adam[name].step(self.nets[name].theta, grad)
 
+    def begin_from(self, path):
+        """Go on from shipped networks, which have no optimiser: their weights, statistics and count of updates.
+
+        Raises    UserError: networks of other sizes
+        Test      tests/test_drop_vae.py::test_training_from_shipped_networks
+        """
+        motion, pose, meta = load_networks(path)
+        for k, net in vae.networks(motion, pose).items():
+            if net.shapes != self.nets[k].shapes:
+                o = meta["options"]
+                sizes = " ".join(f"--{n.replace('_', '-')} {o[n]}" for n in SIZES)
+                raise UserError(f"{path}: its networks have other sizes; give them: {sizes}")
+            self.nets[k].theta[:] = net.theta
+        self.motion.stats, self.pose.stats = motion.stats, pose.stats
+        self.updates = int(meta["updates"])
+
     def arrays(self):
         """Everything a checkpoint holds: weights, statistics, moments."""
         out = network_arrays(self.motion, self.pose)
@@ -282,6 +300,8 @@ def train(opt):
     if opt.resume and (found := latest_checkpoint(opt.out)):
         trainer.restore(*found, Path(opt.out) / CHECKPOINT)
         meta = found[1]
+    elif opt.init:
+        trainer.begin_from(opt.init)
     out = open_run(opt.out, opt, opt.resume)
     metrics = Metrics(out / METRICS, meta["rows"] if opt.resume else None)
     progress, saved = Progress(opt.updates, trainer.updates, "updates"), time.monotonic()

@@ -910,6 +910,27 @@ def test_nearest_prior_sees_a_new_floor():
     assert np.abs(p.mode(state)[0] - level).max() > 0.01
 
 
+def test_slope():
+    """Joint by joint from the plane's height; undone exactly; feet are as far from the plane as from a level floor."""
+    from drop_prior import ANKLES, SLOPED, level_state, slope
+
+    floor = Plane([-0.2, 0.15, 1.0], 0.3)
+    x, quat = motion("walk")
+    x, v = x[60], (x[60] - x[59]) / STEP
+    height = lambda p: (floor.offset - floor.normal[:2] @ p[:2]) / floor.normal[2]  # noqa: E731
+    low = min(0.0, *(height(x[j]) - height(x[0]) for j in ANKLES))
+    wanted = [s * (height(p) - height(x[0])) + (1 - s) * low for s, p in zip(SLOPED, x)]
+    np.testing.assert_allclose(slope(floor, x), wanted, atol=1e-12)
+    np.testing.assert_allclose(slope(Plane(), x), 0.0, atol=1e-15)
+    lift = np.zeros_like(x)
+    lift[:, 2] = slope(floor, x)
+    level = level_state(floor, State(x + lift, v, quat[60]))
+    np.testing.assert_allclose(level.x, x, atol=1e-12)
+    np.testing.assert_allclose(drop.forward_kinematics(x[0], level.quat), x, atol=1e-9)
+    for j in drop.FEET:
+        assert (x + lift)[j, 2] - height(x[j]) == pytest.approx(x[j, 2] - height(x[0]), abs=1e-12)
+
+
 def test_starting_under_the_floor():
     """`begin` lifts the body out; a body sunk later is pushed out without being thrown into the air."""
     x, quat = (a[30] for a in motion())

@@ -293,6 +293,9 @@ def drop_turn(a, b):
 def test_a_tripped_runner_falls_and_a_walker_is_stopped(stage):
     walk, run = demos.trip(stage, np.random.default_rng(0))
     assert "heel held" in walk.notes and "heel held" in run.notes
+    assert -5 <= numbers(walk.notes["heel held"].split(",")[1])[0] <= 30, (
+        "caught while it swings, behind the other foot"
+    )
     slowest = float(re.search(r"([\d.]+) at the least", walk.notes["stumble"])[1])
     assert slowest < 0.8
     assert demos.measure(run)[0]["end"] == "fell"
@@ -301,7 +304,7 @@ def test_a_tripped_runner_falls_and_a_walker_is_stopped(stage):
 def test_a_tilted_walker_stays_on_the_platform(stage):
     for take in demos.tilt(stage, np.random.default_rng(0)):
         (r,) = demos.measure(take)
-        assert r["end"] == "upright" and r["below_mm"] < 60
+        assert r["end"] == "upright" and r["below_mm"] < 40 and r["slide"] < 0.3
         assert np.degrees(np.arccos(take.floor[-1].normal[2])) == pytest.approx(15)
 
 

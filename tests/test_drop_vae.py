@@ -312,6 +312,27 @@ def test_training_resumes(tmp_path, monkeypatch):
         training.train(training.replace(opt, resume=True))
 
 
+def test_training_from_shipped_networks(tmp_path, monkeypatch):
+    """Goes on at the shipped count of updates from the very weights; other sizes are refused with the right ones."""
+    monkeypatch.setattr(training, "recorded", lambda *a, **k: [motion()])
+    out, file = str(tmp_path / "a"), str(tmp_path / "w.npz")
+    training.train(training.Options(out=out, **TINY))
+    training.ship(training.Options(out=out, weights=file))
+    net, pose, meta = load_networks(file)
+    longer = TINY | {"updates": meta["updates"] + TINY["rollout"]}
+    t = training.Trainer(training.Options(**longer), recording())
+    t.begin_from(file)
+    assert t.updates == meta["updates"] == TINY["updates"]
+    for name, shipped_net in vae.networks(net, pose).items():
+        np.testing.assert_array_equal(t.nets[name].theta, shipped_net.theta)
+    np.testing.assert_array_equal(t.motion.stats["scale"], net.stats["scale"])
+    t = training.train(training.Options(out=str(tmp_path / "b"), init=file, **longer))
+    assert t.updates == longer["updates"]
+    other = training.Options(out=str(tmp_path / "c"), init=file, **(longer | {"latent": TINY["latent"] + 1}))
+    with pytest.raises(UserError, match=f"--latent {TINY['latent']}"):
+        training.train(other)
+
+
 def test_linear_baseline():
     """Ridge regression against SciPy's least squares; what one_step says against a slow loop; alone it drifts."""
     rng = RNG(10)
