@@ -42,6 +42,8 @@ class Options(demos.Options):
     frames: int = arg(160, "energies: frames of each", check=POSITIVE)
     newton: float = arg(60.0, "the push, 0.5 s on the pelvis, horizontally anywhere [N on 22 kg]", check=POSITIVE)
     samples: int = arg(16, "energies: samples of the prior a frame", check=POSITIVE)
+    inside: str = arg("free", "energies: does the range of motion's energy act inside the limits (drop.Simulator)",
+                      choices=("always", "never", "free"))  # fmt: skip
     csv: str | None = arg(None, "energies: write the medians here")
 
 
@@ -104,7 +106,7 @@ def ensemble(stage, opt, contact=True, limits=True):
         if hasattr(prior, "floor"):
             prior.floor = None
         sim = Watched(prior, contact=contact, limits=stage.limits if limits else None, correction=opt.correction,
-                      samples=opt.samples)  # fmt: skip
+                      samples=opt.samples, inside=opt.inside)  # fmt: skip
         sim.measure = stage.limits or drop.project_range_of_motion
         state = sim.begin(x[at], quat[at], (x[at] - x[at - 1]) / STEP)
         force = demos.one_force("pelvis", opt.newton * np.array([np.cos(angle), np.sin(angle), 0.0]))
@@ -156,7 +158,8 @@ def energies(opt):
                 values = "  ".join(f"{k} {v:.3g}" for k, v in zip(TERMS, m.mean(axis=0)))
                 lines.append(f"  {label:9s}{values}  J")
     frames = opt.frames * 2 * opt.count
-    print(f"{opt.count} motions of {opt.frames} frames, {len(stage.clips)} clips; prior {opt.prior}, range {opt.range};"
+    print(f"{opt.count} motions of {opt.frames} frames, {len(stage.clips)} clips; prior {opt.prior}, range {opt.range},"
+          f" inside {opt.inside};"
           f" {frames / (time.process_time() - began):.0f} frames/s")  # fmt: skip
     print("\n".join(lines))
     if opt.frames > RECOVERY[0]:

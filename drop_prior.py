@@ -269,18 +269,33 @@ class VaePrior:
         return self._mode[1:]
 
 
+def pose_angles(pose, C):
+    r"""The largest angle [rad] (B,) between the joints of poses (B, 16, 2, 3) and of decoded ones C (B, 22, 3, 3).
+
+    Equation  cos θ = (tr(Aᵀ B) − 1)/2, of rotations relative to the pelvis
+    Test      tests/test_drop_vae.py::test_pose_range
+    """
+    A, _ = vae.gram_schmidt_forward(pose)
+    trace = np.einsum("bjki,bjki->bj", A, C[:, vae.POSE])
+    return np.arccos(np.clip(0.5 * (trace.min(axis=1) - 1.0), -1.0, 1.0))
+
+
 class PoseRange:
     r"""Range of motion by the pose VAE: `limits` of drop.Simulator  [DROP Eqs. 7, 15].
 
     Equation  [DROP Eq. 15] q_r = D(r E(q)/‖E(q)‖) if ‖E(q)‖ > r, else q; then forward kinematics, laid on x as a rigid
               body as `drop.project_range_of_motion` does
-    ASSUMED   r: 6 belongs to VPoser; ours is the 99.9th percentile of ‖E‖ over held-out poses
-    Args      net : drop_vae.PoseVAE; bound : r
+    Departs   E maps a knee bent backwards inside: ‖E‖ tells how far a pose is along what varies in the data, and that
+              is not along it.  So a pose is outside, too, if a joint of D(E(q)) is more than `angle` from q's; then
+              q_r = D(E(q))
+    ASSUMED   r: 6 belongs to VPoser; ours is the 99.9th percentile of ‖E‖ over held-out poses; `angle` twice that of
+              the largest angle between q and D(E(q))
+    Args      net : drop_vae.PoseVAE; bound : r; angle : [rad]
     Test      tests/test_drop_vae.py::test_pose_range
     """
 
-    def __init__(self, net, bound):
-        self.net, self.bound = net, float(bound)
+    def __init__(self, net, bound, angle=np.inf):
+        self.net, self.bound, self.angle = net, float(bound), float(angle)
 
     def norm(self, C):
         """‖E(q)‖ (B,) of rotations (B, 22, 3, 3), whose rows are the columns."""
@@ -289,11 +304,13 @@ class PoseRange:
     def __call__(self, x, twist):
         R, _ = swing_twist(x, twist)
         C = np.swapaxes(R, -1, -2)[None].astype(np.float32)
-        z = self.net.encode(vae.pose_columns(C))
+        pose = vae.pose_columns(C)
+        z = self.net.encode(pose)
         norm = float(np.sqrt(z[0] @ z[0]))
-        if not norm > self.bound:
+        decoded = self.net.decode(z * np.float32(min(1.0, self.bound / max(norm, 1e-9))))
+        if not (norm > self.bound or pose_angles(pose, decoded)[0] > self.angle):
             return x
-        inside = self.net.decode(z * np.float32(self.bound / norm))[0].astype(float)
+        inside = decoded[0].astype(float)
         out = PATH @ np.matmul(OFFSETS[1:, None], inside[PARENTS[1:]])[:, 0]
         out, centre = out - out.mean(axis=0), x.mean(axis=0)
         return out @ align(out[None], (x - centre)[None])[0].T + centre

@@ -25,7 +25,7 @@ import drop
 import drop_vae as vae
 import mocap
 from drop import FEET, STEP, N, Simulator
-from drop_prior import WEIGHTS, NearestPrior, PoseRange, VaePrior, load_networks
+from drop_prior import WEIGHTS, NearestPrior, PoseRange, VaePrior, load_networks, pose_angles
 from nn import Adam, clip_grad_norm
 from runs import (
     CHECKPOINT,
@@ -437,13 +437,17 @@ def pose_norms(net, recording, frames):
 
 
 BOUND_PERCENTILE = 99.9  # of held-out poses: the boundary of the range of motion
+ANGLE_FACTOR = 2.0  # ASSUMED: of that percentile of the angle, so that other styles stay inside
 
 
 def calibrate(net, recording):
-    """The bound r of Eq. 15: a percentile of ‖E(q)‖ over held-out poses.
+    """The bound r of Eq. 15, a percentile of ‖E(q)‖ over held-out poses; and PoseRange's angle [rad].
 
     Test: tests/test_drop_vae.py::test_pose_range"""
-    return float(np.percentile(pose_norms(net, recording, np.arange(len(recording.x)))[0], BOUND_PERCENTILE))
+    norms, _ = pose_norms(net, recording, np.arange(len(recording.x)))
+    pose = vae.pose_columns(vae.gram_schmidt_forward(recording.columns)[0])
+    angles = pose_angles(pose, net.decode(net.encode(pose)))
+    return float(np.percentile(norms, BOUND_PERCENTILE)), ANGLE_FACTOR * float(np.percentile(angles, BOUND_PERCENTILE))
 
 
 WRONG = {  # joint, axis of its own frame, degrees: what no body does
@@ -453,15 +457,16 @@ WRONG = {  # joint, axis of its own frame, degrees: what no body does
 }  # fmt: skip
 
 
-def detection(net, bound, recording, rng, n=500):
+def detection(limit, recording, rng, n=500):
     r"""Share of poses, each with one joint turned to where it cannot be, that each range of motion calls outside.
 
-    Returns   {what: (share by the pose VAE, share by drop.LIMITS)}, `recorded` first
+    Args      limit : PoseRange
+    Returns   {what: (share by ‖E‖ alone, by the pose VAE, by drop.LIMITS)}, `recorded` first
     Test      tests/test_drop_vae.py::test_pose_range
     """
     frames = rng.choice(len(recording.x), n, replace=False)
     C0, _ = vae.gram_schmidt_forward(recording.columns[frames].astype(float))
-    out, limit = {}, PoseRange(net, bound)
+    out, norm = {}, PoseRange(limit.net, limit.bound)
     for what, change in {"recorded": None, **WRONG}.items():
         C = C0.copy()
         if change is not None:
@@ -478,7 +483,7 @@ def detection(net, bound, recording, rng, n=500):
         )
         by = [
             [rule(a, drop.twists(q)) is not a for a, q in zip(x, quat)]
-            for rule in (limit, drop.project_range_of_motion)
+            for rule in (norm, limit, drop.project_range_of_motion)
         ]
         out[what] = tuple(float(np.mean(b)) for b in by)
     return out
@@ -510,9 +515,11 @@ def evaluate(opt):
         p = np.percentile(norms, [50, 99, 99.9])
         print(f"  ‖E(q)‖: median {p[0]:.2f}, 99 % {p[1]:.2f}, 99.9 % {p[2]:.2f}; bound {meta['bound']:.2f}")
     last = list(recordings.values())[-1]
-    found = detection(pose, meta["bound"], recordings.get("validation", last), rng, min(500, len(last.x)))
-    for what, (by_vae, by_limits) in found.items():
-        print(f"  outside, {what:28s} pose VAE {100 * by_vae:5.1f} %   limits {100 * by_limits:5.1f} %")
+    limit = PoseRange(pose, meta["bound"], meta.get("angle", np.inf))
+    found = detection(limit, recordings.get("validation", last), rng, min(500, len(last.x)))
+    for what, by in found.items():
+        shares = (f"{rule} {100 * b:5.1f} %" for rule, b in zip(("‖E‖", "pose VAE", "limits"), by, strict=True))
+        print(f"  outside, {what:28s} " + "   ".join(shares))
 
 
 # ------------------------------------------------------------------------------------ long rollouts
@@ -564,7 +571,7 @@ def rollout(opt, stride=5):
     limit = float(np.percentile(d, 99))
     print(f"held-out clips: nearest recorded frame {100 * np.median(d):.1f} cm, the limit (99 %) {100 * limit:.1f} cm")
     prior, rng = VaePrior(motion), np.random.default_rng(opt.seed)
-    limits = PoseRange(pose, meta["bound"])
+    limits = PoseRange(pose, meta["bound"], meta.get("angle", np.inf))
     x, q = held[0]
     for name, sim in (("prior alone", None), ("inside DROP", Simulator(prior, limits=limits))):
         began = time.process_time()
@@ -610,7 +617,8 @@ def ship(opt):
     )
     options = {k: v for k, v in trained.items() if k not in ("weights", "out", "resume")} | {"motion": source.name}
     licence = "MIT" if trained["motion"] == "builtin" else f"weights trained on {source.name}, licensed: {title}"
-    kept = {"options": options, "updates": meta["updates"], "bound": calibrate(pose, held), "licence": licence,
+    bound, angle = calibrate(pose, held)
+    kept = {"options": options, "updates": meta["updates"], "bound": bound, "angle": angle, "licence": licence,
             "versions": versions(), "git": git_state()}  # fmt: skip
     save_checkpoint(opt.weights, network_arrays(motion, pose, np.float16), kept)
     return kept

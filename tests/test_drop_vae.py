@@ -370,7 +370,7 @@ def test_shipped():
     _, _, meta = shipped()
     assert drop_prior.WEIGHTS.stat().st_size < 4e6
     assert "bandai" in meta["licence"] and "NonCommercial" in meta["licence"] and meta["options"]["motion"] == "bandai"
-    assert meta["bound"] > 1 and meta["updates"] >= 1000
+    assert meta["bound"] > 1 and 0.2 < meta["angle"] < 1.5 and meta["updates"] >= 1000
 
 
 def test_shipped_on_held_out_clips(mocap_dir):
@@ -391,10 +391,8 @@ def test_ship_and_load(tmp_path, monkeypatch):
     meta = training.ship(training.Options(out=out, weights=str(tmp_path / "w.npz")))
     net, pose, read = load_networks(tmp_path / "w.npz")
     np.testing.assert_allclose(net.nets["decoder"].theta, t.motion.nets["decoder"].theta, atol=1e-3)
-    assert (
-        read["bound"] == meta["bound"] == training.calibrate(t.pose, t.recording)
-        or abs(read["bound"] - meta["bound"]) < 1e-9
-    )
+    assert (read["bound"], read["angle"]) == pytest.approx((meta["bound"], meta["angle"]), abs=1e-9)
+    assert (meta["bound"], meta["angle"]) == pytest.approx(training.calibrate(t.pose, t.recording), rel=0.01)
     assert read["licence"] == "MIT"
     save_checkpoint(tmp_path / "x.npz", {"motion.mean": np.zeros(3), "pose.mean": np.zeros(3)}, {"options": {}})
     with pytest.raises(UserError, match="not DROP's priors"):
@@ -441,7 +439,7 @@ def test_vae_prior():
 def test_pose_range():
     """Inside: the very same array.  Outside: ‖E‖ comes down to about the bound, bones are exact, no net force."""
     _, pose, meta = shipped()
-    limit = PoseRange(pose, meta["bound"])
+    limit = PoseRange(pose, meta["bound"], meta["angle"])
     x, quat = motion()
     assert limit(x[60], drop.twists(quat[60])) is x[60] or np.array_equal(limit(x[60], drop.twists(quat[60])), x[60])
     tight = PoseRange(pose, 0.5 * training.pose_norms(pose, recording(), np.array([60]))[0][0])
@@ -452,11 +450,21 @@ def test_pose_range():
     assert np.abs(np.cross(x[60] - x[60].mean(axis=0), out - x[60]).sum(axis=0)).max() < 1e-6  # and no torque
     R, _ = drop.swing_twist(out, drop.twists(quat[60]))
     assert tight.norm(np.swapaxes(R, 1, 2)[None].astype(np.float32))[0] < 2.0 * tight.bound
-    bound = training.calibrate(pose, recording())
+    bound, angle = training.calibrate(pose, recording())
     norms, mm = training.pose_norms(pose, recording(), np.arange(len(recording().x)))
     assert bound == pytest.approx(np.percentile(norms, 99.9)) and mm.mean() < 60
-    found = training.detection(pose, meta["bound"], recording(), RNG(0), n=20)
-    assert found["recorded"][0] < 0.3 and max(f[0] for f in found.values()) > 0.5
+    R, _ = drop.swing_twist(x[60], drop.twists(quat[60]))
+    C = np.swapaxes(R, 1, 2)[None].astype(np.float32)
+    D = pose.decode(pose.encode(vae.pose_columns(C)))
+    local = Rotation.from_matrix(R[0].T @ R[vae.POSE])  # SciPy's angles between the joints of q and D(E(q))
+    apart = (local.inv() * Rotation.from_matrix(np.swapaxes(D[0, vae.POSE], 1, 2))).magnitude().max()
+    assert drop_prior.pose_angles(vae.pose_columns(C), D)[0] == pytest.approx(apart, abs=1e-3)
+    pose_now, twist = x[60], drop.twists(quat[60])
+    assert PoseRange(pose, 1e9, 0.99 * apart)(pose_now, twist) is not pose_now
+    assert PoseRange(pose, 1e9, 1.01 * apart)(pose_now, twist) is pose_now
+    found = training.detection(limit, recording(), RNG(0), n=20)
+    assert found["recorded"][1] < 0.3 and min(f[1] for w, f in found.items() if w != "recorded") > 0.9
+    assert found["knee 60 degrees backwards"][0] < 0.5, "‖E‖ alone sees it now: drop the angle"
 
 
 @pytest.mark.parametrize("limits", ["vae", "limits"])
@@ -464,7 +472,8 @@ def test_drop_with_learned_priors(limits):
     """Five seconds of walking inside DROP: upright, on its feet, never NaN; a push moves it."""
     net, pose, meta = shipped()
     sim = Simulator(
-        VaePrior(net), limits=PoseRange(pose, meta["bound"]) if limits == "vae" else drop.project_range_of_motion
+        VaePrior(net),
+        limits=PoseRange(pose, meta["bound"], meta["angle"]) if limits == "vae" else drop.project_range_of_motion,
     )
     state, rng, force = start(sim), RNG(0), np.zeros((N, 3))
     begin = state.x[0].copy()
