@@ -12,6 +12,7 @@ import render
 from drop import RADII, STEP, J, N, Plane, Simulator, State
 from runs import UserError, run_main
 
+ALL = demos.BUILTIN
 SHORT = (
     ("walk", 8, {"speed": 1.2}), ("jog", 8, {"speed": 2.5}), ("turn", 8, {"speed": 1.1, "turn_rate": 0.6}),
     ("stand", 6, {}), ("sidestep", 6, {"sidestep": 0.4}),
@@ -301,8 +302,10 @@ def test_a_tripped_runner_falls_and_a_walker_is_stopped(stage):
     assert demos.measure(run)[0]["end"] == "fell"
 
 
-def test_a_tilted_walker_stays_on_the_platform(stage):
-    for take in demos.tilt(stage, np.random.default_rng(0)):
+def test_a_tilted_walker_stays_on_the_platform(monkeypatch):
+    """With all built-in clips, some of them slow: five clips leave a walker on a slope without a transition."""
+    monkeypatch.setattr(demos, "BUILTIN", ALL)
+    for take in demos.tilt(demos.Stage(demos.Options()), np.random.default_rng(0)):
         (r,) = demos.measure(take)
         assert r["end"] == "upright" and r["below_mm"] < 40 and r["slide"] < 0.3
         assert np.degrees(np.arccos(take.floor[-1].normal[2])) == pytest.approx(15)
