@@ -481,7 +481,7 @@ def constrain(stage, rng):
 
 
 def trip(stage, rng):
-    """§8.2: the left heel of a walker and of a runner held for 1 s, caught as it swings up to the other foot."""
+    """§8.2: the left heel of a walker and of a runner held for 1 s, caught as it swings past the other foot."""
     return [_trip(stage, stage.again(), speed) for speed in (1.2, 2.5)]
 
 
@@ -492,7 +492,7 @@ def _trip(stage, rng, speed, hold=30):
     def act(t, state):
         forward = quat_rotate(quat_about(2, heading(state.quat[0])), np.array([1.0, 0, 0]))
         ahead = (state.x[J["ankle_l"]] - state.x[J["ankle_r"]]) @ forward
-        if not held and t > 20 and -0.3 < ahead < 0.05 and state.v[J["ankle_l"]] @ forward > 1.0:
+        if not held and t > 20 and -0.15 < ahead < 0.05 and state.v[J["ankle_l"]] @ forward > 1.0:
             held.update(at=state.x[J["ankle_l"]].copy(), t=t, ahead=ahead)
         on = held and t < held["t"] + hold
         ball = [(held["at"], 0.05, (0.9, 0.1, 0.1, 1))] if on else []
