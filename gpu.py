@@ -77,11 +77,6 @@ class Worlds:
     def expand(self, name):
         return np.zeros(self.n, int)  # `Env` switches forces off while it refreshes; `forward` computes none
 
-    @property
-    def state(self):
-        fields = ("qpos", "qvel", "qacc_warmstart")
-        return self.xp.concatenate([self.bind(f) for f in fields], axis=1)
-
     def step(self, nstep=1):
         """nstep substeps of every world."""
         self._run(("step", nstep), lambda: [self.mjw.step(self.model, self.data) for _ in range(nstep)])

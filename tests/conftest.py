@@ -37,3 +37,20 @@ def motions_once():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mocap, "builtin_clips", functools.cache(mocap.builtin_clips))
         yield
+
+
+@pytest.fixture(scope="module")
+def char():
+    """Jesse, one a module: what a module changes of it no other sees."""
+    import character
+
+    return character.load("jesse")
+
+
+@pytest.fixture(scope="module")
+def ref(char):
+    """Two seconds each of a few built-in motions, retargeted."""
+    import mocap
+    import retarget
+
+    return retarget.reference(char, [c[:60] for c in mocap.load("builtin", clips="*_00[57]")])

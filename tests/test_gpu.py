@@ -6,24 +6,12 @@ import pytest
 
 import character
 import gpu
-import mocap
 import nn
 import ppo
-import retarget
 from env import Env
 from runs import UserError, load_checkpoint, run_main
 
 pytestmark = pytest.mark.usefixtures("motions_once")
-
-
-@pytest.fixture(scope="module")
-def char():
-    return character.load("jesse")
-
-
-@pytest.fixture(scope="module")
-def ref(char):
-    return retarget.reference(char, [c[:60] for c in mocap.load("builtin", clips="*_00[57]")])
 
 
 def trainer(char, ref, **options):

@@ -13,7 +13,6 @@ import gym_env
 import mocap
 import ppo
 import render
-import retarget
 from env import Env
 from runs import CHECKPOINT, METRICS, UserError, load_checkpoint, read_metrics, run_main
 
@@ -22,16 +21,6 @@ gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 pytestmark = [pytest.mark.usefixtures("motions_once"), pytest.mark.filterwarnings("ignore::DeprecationWarning")]
-
-
-@pytest.fixture(scope="module")
-def char():
-    return character.load("jesse")
-
-
-@pytest.fixture(scope="module")
-def ref(char):
-    return retarget.reference(char, [c[:60] for c in mocap.load("builtin", clips="*_00[57]")])
 
 
 def actions(n, steps, size=33, scale=0.5, seed=0):

@@ -32,16 +32,6 @@ TINY = "--clips *stand* --envs 8 --horizon 8 --minibatch 32 --hidden 12 --value-
 pytestmark = pytest.mark.usefixtures("motions_once")
 
 
-@pytest.fixture(scope="module")
-def char():
-    return character.load("jesse")
-
-
-@pytest.fixture(scope="module")
-def ref(char):
-    return retarget.reference(char, [c[:60] for c in mocap.load("builtin", clips="*_00[57]")])
-
-
 def tiny(**changes):
     small = dict(envs=6, horizon=8, minibatch=16, hidden=(12,), value_hidden=(10, 8), threads=1)
     return Options(**small | changes)
