@@ -66,7 +66,7 @@ class Options(character.Switches):
     """What to time, and how often."""
 
     character: str | None = arg(None, "one character; all of them by default")
-    motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
+    motion: str = arg("builtin", mocap.MOTION)
     clips: str = arg("*", "shell pattern on clip names")
     envs: int = arg(512, "characters simulated side by side", check=COUNT)
     threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)

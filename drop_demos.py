@@ -42,7 +42,7 @@ class Options:
 
     prior: str = arg("nearest", "nearest transitions, the learned prior, the clip's next frame, or none (a rag doll)",
                      choices=("nearest", "vae", "clip", "none"))  # fmt: skip
-    motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
+    motion: str = arg("builtin", mocap.MOTION)
     clips: str = arg("*", "shell pattern on clip names, for files and folders")
     seed: int = arg(0, "seed of the prior's samples", check=NONNEGATIVE)
     png: str | None = arg(None, "write a contact sheet here")

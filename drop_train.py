@@ -60,7 +60,7 @@ COUNT_SHOWN = 25  # rollouts a printed line
 class Options:
     """What to train on, and how.  Everything here is ASSUMED: DROP takes its priors ready made."""
 
-    motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
+    motion: str = arg("builtin", mocap.MOTION)
     clips: str = arg("*", "shell pattern on clip names")
     out: str = arg("runs/drop_prior", "run folder")
     resume: bool = arg(False, "continue the run in --out exactly")

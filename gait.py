@@ -181,6 +181,9 @@ class GaitParams:
     sidestep: float = 0.0  # sideways speed [m/s], left +
     gesture: str | None = None  # one of GESTURES, or None for a random sequence (kind "gesture")
     amplitude: float = 1.0  # scale of the gestures
+    strokes: float = 0.0  # arm strokes a second and arm, as in a game of swords and drums
+    sway: float = 1.0  # scale of how far a standing pelvis wanders sideways
+    crouch: float = 0.0  # deepest bow of the knees while standing: how far the pelvis sinks [m]
     height: float = 1.75  # stature [m]
     variation: float = 1.0  # 0 removes all randomness, 1 is natural
 
@@ -208,6 +211,9 @@ GESTURES = {
     "both_up": ("both", (140, 25, 0, 20)),
     "carry": ("both", (20, 8, 5, 85)),
 }
+# ASSUMED range of the arm poses of strokes [deg], the same four angles: hands before the body, from the hips to above
+# the head.
+STROKES = ((-10, 130), (0, 50), (-30, 50), (10, 110))
 
 
 def smooth(x):
@@ -499,13 +505,34 @@ def _gestures(angles, t, duration, p, rng):
     return out
 
 
+def _strokes(angles, t, duration, p, rng):
+    """Arms that strike: from pose to pose, one movement every 1 / p.strokes seconds and arm on average.
+
+    ASSUMED   poses uniform in STROKES; a movement lasts 0.15 to 0.45 s (min-jerk); wrists turn by up to 25 degrees
+    Returns   angles (T, 2, 4) as `_arm_base`, wrist (T, 2, 2) flexion and abduction [rad]
+    """
+    out, wrist = angles.copy(), np.zeros((len(t), 2, 2))
+    low, high = np.array(STROKES).T * DEG
+    for j in (0, 1):
+        now, pose, turn = rng.uniform(0.0, 1.0), out[0, j], np.zeros(2)
+        while now < duration:
+            goal, goal_turn = rng.uniform(low, high), rng.uniform(-25, 25, 2) * DEG
+            done = smooth((t - now) / rng.uniform(0.15, 0.45))[:, None]
+            out[:, j] += done * (goal - pose)
+            wrist[:, j] += done * (goal_turn - turn)
+            pose, turn = goal, goal_turn
+            now += max(rng.exponential(1.0 / p.strokes), 0.2)
+    return out, wrist
+
+
 def generate(kind, duration, rate=30.0, seed=0, **params):
     r"""One clip of procedural human motion.
 
     Equation  none: footholds on an integrated path, two-bone legs, normative curves (module docstring)
     ASSUMED   step width, place of the foothold under the body, lift of the foot (both set so that the knee and hip
               follow the curves), trunk and head amplitudes, lean of 0.6 of the balanced one in curves, arm poses of
-              gestures, start and stop in 1.2 s, all random variation
+              gestures, start and stop in 1.2 s, all random variation; in a crouch of 0.1 m the trunk bows by 12
+              degrees and the pelvis goes back by 3 cm, so that the weight stays above the feet
     Args      kind : one of KINDS; duration [s]; rate [1/s]; seed : int
               params : fields of GaitParams
     Returns   dict pos (T, 15, 3) [m], quat (T, 15, 4) w, x, y, z, ball (T, 2, 3) left, right [m], rate, name;
@@ -523,6 +550,10 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
         raise ValueError(f"gesture {p.gesture!r}: valid are {', '.join(GESTURES)}")
     if duration * rate < 2 or p.height <= 0 or p.speed < 0:
         raise ValueError(f"duration {duration}, rate {rate}, height {p.height}, speed {p.speed}: must be positive")
+    if not (0 <= p.strokes <= 5 and 0 <= p.sway <= 5 and 0 <= p.crouch <= 0.3):
+        raise ValueError(
+            f"strokes {p.strokes}, sway {p.sway}, crouch {p.crouch}: valid are 0 to 5 a second, 0 to 5, 0 to 0.3 m"
+        )
     rng = np.random.default_rng(seed)
     body, plan = Body(p.height), _Plan(kind, duration, rate, p, rng)
     size = p.height / 1.75
@@ -561,6 +592,8 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
     amount = np.clip(forward, 0, 1.15)
     sway_noise, look, nod = (_noise(rng, t, f) * p.variation for f in (0.25, 0.22, 0.3))
     still = 1 - gate
+    play = np.random.default_rng([seed, 1])  # of strokes and crouches, so that a clip without them is what it was
+    dip = p.crouch * size * still * np.clip(_noise(play, t, 0.35), 0.0, 1.0) if p.crouch else 0.0 * t
 
     # Pelvis and trunk. Sideways towards the standing leg, up in its middle (walking) or down (jogging).
     cyc = 2 * np.pi * (phase - 0.5 * plan.duty)
@@ -570,14 +603,14 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
     else:
         up = 0.5 * np.clip(0.0274 + 0.0232 * (v - 0.7), 0.0, 0.055) * gate * size * np.cos(2 * cyc + 0.4)
         side = 0.5 * np.clip(0.0699 - 0.0349 * (v - 0.7), 0.03, 0.07) * gate * size * np.cos(cyc)  # [Orendurff04]
-    side = side + 0.020 * size * still * sway_noise
+    side = side + 0.020 * p.sway * size * still * sway_noise
     lean = style["lean"] * v * turn / GRAVITY
     yaw_p = -4 * DEG * amount * np.cos(2 * np.pi * phase) * vary(0.15)
     roll_p = 3.5 * DEG * amount * np.sin(2 * np.pi * (phase + 0.1)) - lean + 1.5 * DEG * still * sway_noise
-    pitch_p = (5 if plan.jog else 1) * DEG * amount
+    pitch_p = (5 if plan.jog else 1) * DEG * amount + 60 * DEG * dip
     look_yaw = still * 28 * DEG * np.tanh(look) + np.interp(t + 0.35, plan.t, plan.psi) - psi
     yaw_c = 3.5 * DEG * amount * np.cos(2 * np.pi * phase) * vary(0.15) + 0.2 * look_yaw
-    pitch_c = (9 if plan.jog else 2.5) * DEG * amount + 1 * DEG * nod * still
+    pitch_c = (9 if plan.jog else 2.5) * DEG * amount + 1 * DEG * nod * still + 120 * DEG * dip
     r_pelvis = _rot("z", psi + yaw_p) @ _rot("y", pitch_p) @ _rot("x", roll_p)
     r_chest = _rot("z", psi + yaw_c) @ _rot("y", pitch_c) @ _rot("x", -0.3 * (roll_p + lean) - 1.2 * lean)
     r_head = _rot("z", psi + look_yaw) @ _rot("y", 2 * DEG + 6 * DEG * still * nod) @ _rot("x", -0.3 * lean)
@@ -586,7 +619,9 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
     scale = amount if plan.jog else np.minimum(amount, 1.1)
     feet = [_foot(plan, body, p, style, s, scale) for s in (1, -1)]
     c, s = np.cos(psi), np.sin(psi)
-    pelvis = np.stack([cut(plan.xy[:, 0]) - s * side, cut(plan.xy[:, 1]) + c * side, 0 * t], 1)
+    back = 0.3 * dip
+    x, y = cut(plan.xy).T
+    pelvis = np.stack([x - s * side - c * back, y + c * side - s * back, 0 * t], 1)
     hips = [pelvis + _apply(r_pelvis, np.array([0, sgn * body.hip_half_width, 0])) for sgn in (1, -1)]
     reach = np.sqrt(body.thigh**2 + body.shin**2 + 2 * body.thigh * body.shin * np.cos(style["knee"]))
     flat = [np.sum((h - f[0])[:, :2] ** 2, 1) for h, f in zip(hips, feet, strict=True)]
@@ -598,7 +633,7 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
         axis=0,
     )
     crouch = 0.045 * size if plan.jog else 0.0
-    height = _lowered(body.thigh + body.shin + body.ankle_height - crouch + up, limit, rate)
+    height = _lowered(body.thigh + body.shin + body.ankle_height - crouch + up, limit, rate) - dip
     pelvis[:, 2] += height
     rots, poss = {"pelvis": r_pelvis, "chest": r_chest, "head": r_head}, {"pelvis": pelvis}
     poss["chest"] = pelvis + _apply(r_pelvis, body.chest)
@@ -618,11 +653,15 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
     arms = _arm_base(plan, phase, gate, amount * vary(0.15), rng, p)
     if kind == "gesture":
         arms = _gestures(arms, t, duration, p, rng)
+    wrist = np.zeros((len(t), 2, 2))
+    if p.strokes:
+        arms, wrist = _strokes(arms, t, duration, p, play)
     for j, (e, sgn) in enumerate((("l", 1), ("r", -1))):
         flex, abd, inward, elbow = arms[:, j].T
         upper = r_chest @ _rot("y", -flex) @ _rot("x", sgn * abd) @ _rot("z", -sgn * inward)
         fore = upper @ _rot("y", -elbow)
-        rots |= {f"upper_arm_{e}": upper, f"forearm_{e}": fore, f"hand_{e}": fore}
+        hand = fore @ _rot("y", -wrist[:, j, 0]) @ _rot("x", sgn * wrist[:, j, 1]) if p.strokes else fore
+        rots |= {f"upper_arm_{e}": upper, f"forearm_{e}": fore, f"hand_{e}": hand}
         poss[f"upper_arm_{e}"] = poss["chest"] + _apply(r_chest, body.shoulder * [1, sgn, 1])
         poss[f"forearm_{e}"] = poss[f"upper_arm_{e}"] + _apply(upper, np.array([0, 0, -body.upper_arm]))
         poss[f"hand_{e}"] = poss[f"forearm_{e}"] + _apply(fore, np.array([0, 0, -body.forearm]))
@@ -665,11 +704,26 @@ MIX = (
 )
 
 
-def library(minutes=10.0, rate=30.0, seed=0):
-    r"""The embedded data set: clips of 20 to 40 s of every kind, byte-identical for a seed.
+# ASSUMED mix of people who stand, look about, gesture, crouch, strike and step: what a user at home mostly does.
+STANDING = (
+    ("stand", {"sway": (1.0, 3.0), "crouch": (0.02, 0.05), "strokes": (0.5, 2.0)}),
+    ("gesture", {"sway": (1.0, 3.0), "crouch": (0.02, 0.10)}),
+    ("sidestep", {"sidestep": (0.2, 0.45), "strokes": (0.5, 2.0)}),
+    ("stand", {"sway": (1.0, 2.0)}),
+    ("start", {"speed": (0.5, 0.9), "sway": (1.0, 2.0)}),
+    ("stand", {"sway": (1.0, 4.0), "crouch": (0.05, 0.25), "strokes": (0.3, 1.5)}),
+    ("gesture", {"sway": (0.5, 2.0)}),
+    ("sidestep", {"sidestep": (-0.45, -0.2), "sway": (1.0, 2.0)}),
+    ("stand", {"sway": (0.5, 3.0), "strokes": (1.0, 3.0)}),
+    ("stop", {"speed": (0.6, 1.2), "sway": (1.0, 2.0)}),
+)
+
+
+def library(minutes=10.0, rate=30.0, seed=0, mix=MIX):
+    r"""An embedded data set: clips of 20 to 40 s of every kind of the mix, byte-identical for a seed.
 
     ASSUMED   the mix and its ranges; speeds grow with the root of the height (equal Froude number)
-    Args      minutes : total length; rate [1/s]; seed : int
+    Args      minutes : total length; rate [1/s]; seed : int; mix : MIX or STANDING
     Returns   list of clips as `generate` returns them; heights 1.5 to 1.9 m; strides within 6 % of the normative ones
     Test      tests/test_gait.py::test_library_covers_everything
     """
@@ -680,7 +734,7 @@ def library(minutes=10.0, rate=30.0, seed=0):
     frames = np.diff(np.round(cuts).astype(int))
     clips = []
     for i, n in enumerate(frames):
-        kind, ranges = MIX[i % len(MIX)]
+        kind, ranges = mix[i % len(mix)]
         params = {k: r[0] if len(r) == 1 else float(rng.uniform(*r)) for k, r in ranges.items()}
         params["height"] = float(rng.uniform(1.5, 1.9))
         if params.get("speed"):
@@ -728,9 +782,10 @@ def main(argv=None):
     ap.add_argument("--minutes", type=float, default=10.0, help="total length [min]")
     ap.add_argument("--rate", type=float, default=30.0, help="frames per second")
     ap.add_argument("--seed", type=int, default=0, help="the same seed gives the same bytes")
+    ap.add_argument("--standing", action="store_true", help="the mix of people who stand")
     args = ap.parse_args(argv)
     print(f"{'clip':<14}{'seconds':>8}{'height':>8}{'m/s':>7}{'slide m/s':>11}{'sink m':>9}")
-    for clip in library(args.minutes, args.rate, args.seed):
+    for clip in library(args.minutes, args.rate, args.seed, STANDING if args.standing else MIX):
         n = len(clip["pos"])
         step = np.linalg.norm(np.diff(clip["pos"][:, 0, :2], axis=0), axis=1).sum() * clip["rate"] / (n - 1)
         slide, sink = foot_report(clip)

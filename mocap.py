@@ -432,21 +432,35 @@ def split_of(name: str) -> str:
     return "validation" if number and number.group(1).endswith("5") else "train"
 
 
-def builtin_clips(rate=CONTROL_RATE, seed=0) -> list[Clip]:
-    """The procedural human of gait.py: the data set that needs no download.  Test: test_mocap.py::test_builtin."""
+BUILTIN = {"builtin": gait.MIX, "standing": gait.STANDING}  # the data sets that need no download
+MOTION = "builtin, standing, a .bvh or .amc file, or a folder of them; or several with commas between them"
+
+
+def builtin_clips(rate=CONTROL_RATE, seed=0, name="builtin") -> list[Clip]:
+    """The procedural human of gait.py: people who walk (builtin) or stand and step (standing).
+
+    Test      tests/test_mocap.py::test_builtin, ::test_joined"""
     out = []
-    library = gait.library(rate=rate, seed=seed)
+    library = gait.library(rate=rate, seed=seed, mix=BUILTIN[name])
     for i, m in enumerate(library):
-        number = (i + 5) % len(library)  # so that the two clips held out, 005 and 015, are straight walks
-        name = f"{m['name'].split('_')[1]}_{number:03d}"
-        out.append(Clip(name, f"builtin-{number:03d}", m["rate"], m["pos"], m["quat"], m["ball"]))
+        number = (i + 5) % len(library)  # so that builtin's two clips held out, 005 and 015, are straight walks
+        title = f"{m['name'].split('_')[1]}_{number:03d}"
+        out.append(Clip(title, f"{name}-{number:03d}", m["rate"], m["pos"], m["quat"], m["ball"]))
     return out
+
+
+def parts(motion) -> list[str]:
+    """The data sets of a --motion: one, or several with commas between them (unless a file has that name).
+
+    Test      tests/test_mocap.py::test_joined"""
+    return str(motion).split(",") if not Path(motion).exists() else [str(motion)]
 
 
 def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS_IT_IS) -> list[Clip]:
     """Single clips of a data set, at one rate.
 
-    Args      motion : "builtin", a .bvh or .amc file, or a folder of them (searched below)
+    Args      motion : "builtin", "standing", a .bvh or .amc file, or a folder of them (searched below); or several of
+              these with commas between them: each must have what is asked for
               clips : shell pattern on the names; reading : what the user says about joints, unit and axes of BVH files
               split : train | validation | style | body | all.  A folder of fewer than ten files none of whose names is
               in the split is used whole, and says so.  .amc clips are in `body` alone, unless motion holds nothing
@@ -457,12 +471,15 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
     """
     if split not in SPLITS:
         raise UserError(f"split {split!r} is unknown; valid: {', '.join(SPLITS)}")
-    if motion == "builtin":
-        items = [(c.name, c.name, c) for c in builtin_clips(rate)]
+    if len(sets := parts(motion)) > 1:
+        return [c for one in sets for c in load(one, rate, clips, split, reading)]
+    if motion in BUILTIN:
+        items = [(c.name, c.name, c) for c in builtin_clips(rate, name=motion)]
     else:
         path = Path(motion)
-        if not path.exists():
-            raise UserError(f"{motion}: no such file or folder; valid: builtin, a .bvh or .amc file, a folder of them")
+        if not str(motion) or not path.exists():
+            valid = "builtin, standing, a .bvh or .amc file, a folder of them, several with commas between them"
+            raise UserError(f"{motion}: no such file or folder; valid: {valid}")
         found = (f for f in path.rglob("*") if f.suffix.lower() in (".bvh", ".amc") and not f.is_dir())
         files = sorted(found) if path.is_dir() else [path]
         if not files:
@@ -480,7 +497,7 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
         names = [name for name, _, _ in items]
         more = f", … ({len(names)})" if len(names) > 6 else ""
         raise UserError(f"{motion}: no clip matches {clips!r}; there are {', '.join(names[:6])}{more}")
-    if not chosen and motion != "builtin" and len(files) < 10 and split not in ("style", "body") and not bodies:
+    if not chosen and motion not in BUILTIN and len(files) < 10 and split not in ("style", "body") and not bodies:
         print(f"{motion}: only {len(files)} clips, none to hold out: {split} uses all of them", file=sys.stderr)
         chosen = [item for _, _, item in matching]
     if not chosen:
@@ -489,7 +506,7 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
             f"{motion}: none of the {len(matching)} clips that match {clips!r} is in split {split!r}; "
             f"they are in {' and '.join(found)}"
         )
-    if motion == "builtin":
+    if motion in BUILTIN:
         return chosen
     return [resample(clip, rate) for clip in rigs.read_clips(chosen, reading, files)]
 
@@ -499,9 +516,12 @@ def sequences(
 ) -> list[Clip]:
     """Stitched sequences of a data set: what training and measuring use.  Test: tests/test_mocap.py::test_sequences.
 
+    Of several sets each is stitched by itself.
     A set of which nothing can be joined into a sequence comes back as its single clips, and says so; one clip alone,
     a user's recording, is not looped.
     """
+    if len(sets := parts(motion)) > 1:
+        return [c for one in sets for c in sequences(one, split, clips, rate, seed, limit, verbose, reading)]
     single = load(motion, rate, clips, split, reading)
     if len(single) == 1:
         if verbose:

@@ -47,7 +47,7 @@ class Options(character.Switches):
     """Which policy, on which motion, and what to make of it."""
 
     character: str | None = arg(None, "name in characters/, or path of a .toml; the policy's own by default, or jesse")
-    motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
+    motion: str = arg("builtin", mocap.MOTION)
     clips: str = arg("*", "shell pattern on clip names")
     joint_map: str | None = arg(None, HELP["joint_map"])
     unit: str | None = arg(None, HELP["unit"])

@@ -89,7 +89,7 @@ class Options(character.Switches):
     Table 3 of the paper (its hyper-parameters) is not in the text we work from: these are ASSUMED, from measured runs.
     """
 
-    motion: str = arg("builtin", "builtin, a .bvh or .amc file, or a folder of them")
+    motion: str = arg("builtin", mocap.MOTION)
     clips: str = arg("*", "shell pattern on clip names, such as '*walk*'")
     joint_map: str | None = arg(None, HELP["joint_map"])
     unit: str | None = arg(None, HELP["unit"])
@@ -425,15 +425,18 @@ def ship(run, path) -> dict:
         motion, _, _, _ = str(meta["options"]["motion"]), meta["options"]["init"], meta["steps"], meta["data"]
     except (KeyError, TypeError) as e:
         raise UserError(f"{run}: does not say how it was trained ({e}); valid: a folder that ppo.py wrote") from None
-    notes = sorted(Path(motion).glob("LICENSE*")) if Path(motion).is_dir() else []
-    title = (
-        notes[0].read_text(errors="replace").strip().split("\n")[0] if notes else "no licence file beside the motion"
-    )
+    names, licences = [], []
+    for part in mocap.parts(motion):
+        names.append(Path(part).name)
+        if part not in mocap.BUILTIN:
+            notes = sorted(Path(part).glob("LICENSE*")) if Path(part).is_dir() else []
+            text = notes[0].read_text(errors="replace") if notes else "no licence file beside the motion"
+            title = text.strip().split("\n")[0]
+            licences.append(f"weights trained on {names[-1]}, licensed: {title}")
     kept = {k: meta[k] for k in ("policy", "steps", "data")}
     init = meta["options"]["init"] and Path(meta["options"]["init"]).name
-    kept["options"] = meta["options"] | {"motion": Path(motion).name, "out": None, "init": init}
-    licence = "MIT" if motion == "builtin" else f"weights trained on {Path(motion).name}, licensed: {title}"
-    kept |= {"licence": licence, "versions": versions(), "git": git_state()}
+    kept["options"] = meta["options"] | {"motion": ",".join(names), "out": None, "init": init}
+    kept |= {"licence": "; ".join(licences) or "MIT", "versions": versions(), "git": git_state()}
     save_checkpoint(path, policy.arrays(), kept)
     return kept
 

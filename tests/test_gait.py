@@ -19,6 +19,11 @@ def clips():
     return gait.library()
 
 
+@pytest.fixture(scope="module")
+def standing():
+    return gait.library(5.0, mix=gait.STANDING)
+
+
 def rotation(clip, name):
     return Rotation.from_quat(clip["quat"][:, INDEX[name]], scalar_first=True)
 
@@ -189,8 +194,8 @@ def test_library_covers_everything(clips):
     assert max(speeds) > 2.5 and sum(0.5 < s < 1.7 for s in speeds) >= 8
 
 
-def test_library_feet_neither_skate_nor_sink(clips):
-    for clip in clips:
+def test_library_feet_neither_skate_nor_sink(clips, standing):
+    for clip in clips + standing:
         slide, sink = gait.foot_report(clip)
         assert slide < 0.05 and sink < 0.005, f"{clip['name']}: slide {slide:.3f} m/s, sink {sink:.3f} m"
 
@@ -207,11 +212,46 @@ def test_library_moves_like_a_human(clips):
         assert np.linalg.norm(acceleration, axis=1).max() < (10 if "jog" in clip["name"] else 6), clip["name"]
 
 
-def test_library_legs_do_not_collide(clips):
-    for clip in clips:
+def test_library_legs_do_not_collide(clips, standing):
+    for clip in clips + standing:
         shin = [0.5 * (clip["pos"][:, INDEX[f"shin_{e}"]] + clip["pos"][:, INDEX[f"foot_{e}"]]) for e in "lr"]
         for a, b in (shin, (clip["pos"][:, INDEX["foot_l"]], clip["pos"][:, INDEX["foot_r"]])):
             assert np.linalg.norm(a - b, axis=1).min() > 0.08, clip["name"]
+
+
+def test_strokes_move_the_hands_alone():
+    """As many movements as asked for, fast, within the ranges; the rest of the body is what it is without them."""
+    calm, busy = (gait.generate("stand", 30, seed=4, strokes=s) for s in (0, 1.5))
+    arms = [INDEX[f"{n}_{e}"] for n in ("upper_arm", "forearm", "hand") for e in "lr"]
+    rest = [i for i in range(len(gait.SEGMENTS)) if i not in arms]
+    assert np.array_equal(calm["pos"][:, rest], busy["pos"][:, rest])
+    for e in "lr":
+        hand = busy["pos"][:, INDEX[f"hand_{e}"]] - busy["pos"][:, INDEX["chest"]]
+        speed = np.linalg.norm(np.diff(hand, axis=0), axis=1) * 30
+        assert 2 < np.percentile(speed, 95) < 8
+        moving = speed > 0.5
+        starts = np.sum(moving[1:] & ~moving[:-1])
+        assert 0.5 < starts / 30 < 2.0, starts
+        elbow = (rotation(busy, f"upper_arm_{e}").inv() * rotation(busy, f"forearm_{e}")).magnitude() / DEG
+        assert 9 < elbow[60:].min() and elbow.max() < 111
+        wrist = (rotation(busy, f"forearm_{e}").inv() * rotation(busy, f"hand_{e}")).magnitude() / DEG
+        assert 10 < wrist.max() < 36
+
+
+def test_crouch_keeps_the_weight_above_the_feet():
+    """The pelvis sinks by as much as was asked for, the feet stay, and the trunk's weight stays above them."""
+    tall, low = (gait.generate("stand", 60, seed=2, crouch=c) for c in (0.0, 0.2))
+    assert 0.15 < (tall["pos"][:, 0, 2] - low["pos"][:, 0, 2]).max() < 0.205  # the bow takes the rest
+    np.testing.assert_allclose(tall["ball"], low["ball"], atol=1e-9)  # legs long enough, knees bent
+    deep = np.argmax(tall["pos"][:, 0, 2] - low["pos"][:, 0, 2])
+    middle = low["pos"][deep, [INDEX["pelvis"], INDEX["chest"], INDEX["head"]], 0].mean()
+    foot = [low["pos"][deep, INDEX["foot_l"], 0] - 0.05, low["ball"][deep, :, 0].max()]
+    assert foot[0] < middle < foot[1]
+
+
+def test_sway_scales():
+    one, three = (np.ptp(gait.generate("stand", 60, seed=2, sway=s)["pos"][:, 0, 1]) for s in (1.0, 3.0))
+    assert np.isclose(three, 3 * one, rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", gait.KINDS)
@@ -230,8 +270,13 @@ def test_errors_name_what_is_valid():
         gait.generate("gesture", 5, gesture="salute")
     with pytest.raises(ValueError, match="positive"):
         gait.generate("walk", 0)
+    for wrong in ({"strokes": -1}, {"sway": 9}, {"crouch": 0.5}, {"strokes": float("nan")}):
+        with pytest.raises(ValueError, match="0 to 0.3 m"):
+            gait.generate("stand", 5, **wrong)
 
 
 def test_main_prints_a_table(capsys):
     gait.main(["--minutes", "0.5"])
     assert "00_walk" in capsys.readouterr().out
+    gait.main(["--minutes", "0.5", "--standing"])
+    assert "00_stand" in capsys.readouterr().out

@@ -643,7 +643,7 @@ def library():
 @pytest.fixture
 def quick_builtin(library, monkeypatch):
     """The built-in clips, made once."""
-    monkeypatch.setattr(mocap, "builtin_clips", lambda rate: library)
+    monkeypatch.setattr(mocap, "builtin_clips", lambda rate, name: library)
 
 
 def test_sequences(tmp_path, capsys, quick_builtin):
@@ -722,6 +722,27 @@ def test_load_errors(tmp_path, quick_builtin):
     assert "broken_002.bvh" in message(tmp_path)
     with pytest.raises(UserError, match="gone.bvh.*expected a regular .bvh file"):
         mocap.from_bvh(tmp_path / "gone.bvh")
+
+
+def test_joined(tmp_path, capsys):
+    """Several sets with commas: each clip of each, each set stitched by itself; a file with a comma is that file."""
+    write_as(tmp_path / "walk,turn_001.bvh", "bandai", walk(3.0))
+    own = str(tmp_path / "walk,turn_001.bvh")
+    assert mocap.parts(own) == [own] and mocap.parts(f"builtin,{tmp_path}") == ["builtin", str(tmp_path)]
+    assert [c.name for c in mocap.load(own)] == ["walk,turn_001"]
+    both = mocap.load(f"builtin,standing,{tmp_path}", split="validation")
+    alone = [c for s in ("builtin", "standing", tmp_path) for c in mocap.load(s, split="validation")]
+    assert len(alone) == 5 and all(a.name == b.name and np.array_equal(a.pos, b.pos) for a, b in zip(both, alone))
+    kinds = {c.name.split("_")[0] for c in mocap.load("standing")}
+    assert kinds == {"stand", "gesture", "sidestep", "start", "stop"}
+    capsys.readouterr()
+    out = mocap.sequences(f"standing,{tmp_path}", "train")
+    assert [c.name for c in out][-1] == "walk,turn_001" and len(out) == 19
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("standing [train] 18 clips") and lines[1].startswith(str(tmp_path))
+    for wrong in ("builtin,", "builtin,nowhere", ","):
+        with pytest.raises(UserError, match="no such file or folder; valid: builtin, standing, "):
+            mocap.load(wrong)
 
 
 def test_builtin(library):

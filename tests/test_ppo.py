@@ -852,5 +852,8 @@ def test_ship(tmp_path, monkeypatch):
     assert meta["licence"] == "weights trained on motion, licensed: Non-commercial." and meta["steps"] == 16
     assert target.stat().st_size < 4e6
     assert str(tmp_path) not in json.dumps(meta)  # no path of the machine
+    ppo.main(["--motion", f"builtin,{folder},standing", "--out", str(tmp_path / "both"), *size])
+    assert ppo.ship(tmp_path / "both", target)["licence"] == meta["licence"]
+    assert ppo.load_policy(target)[1]["options"]["motion"] == "builtin,motion,standing"
     with pytest.raises(UserError):
         ppo.ship(tmp_path / "nothing", target)
