@@ -30,6 +30,7 @@ ROOT_LIMIT = 0.30  # m  [Reda23 §3.6]; ASSUMED in 3-D
 FORCE_LIMIT = 1.0  # N  [Reda23 App. A]
 EPISODE_STEPS = 500  # [Reda23 §3.6]
 SUBSTEPS = 4  # ASSUMED: 1/120 s physics at 30 Hz control (a prototype did not learn at 1/60 s)
+RETRY, PLACES = (3, 60), 512  # ASSUMED: steps before a failure from which it is tried again; failures remembered
 FUTURES = (1, 5, 15)  # ASSUMED: future frames shown to the critic, in control steps
 NO_FORCES = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_SENSOR)
 BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
@@ -363,6 +364,7 @@ class Env:
         disturbance=Disturbance(),  # noqa: B008, it is frozen
         balance=False,
         asymmetric=True,
+        retry=0.0,
     ):
         self.char, self.ref, self.n, self.horizon, self.substeps = char, ref, n, horizon, substeps
         self.name, self.training = char.name, char.training
@@ -396,6 +398,8 @@ class Env:
         self.balance = balance
         self.failed = np.full(len(ref.first), 0.5)  # `balance`: of each sequence, failures and steps lived, of late
         self.lived = np.full(len(ref.first), float(horizon))
+        self.retry = retry
+        self.lost = np.zeros(PLACES, int)  # `retry`: frames at which episodes failed of late; 0: none yet
 
     def attach(self, batch):
         """Where the simulations are: state and kinematics as arrays that share their memory."""
@@ -455,23 +459,36 @@ class Env:
                   half by frames × rate of failure:  p(sequence) ∝ frames (1 + h / ⟨h⟩) / E[T],
                   E[T] = (1 − e^{−hH}) / h, within the sequence uniform
         Symbols   h failures a step, of late (`_count`); ⟨h⟩ its mean over frames; H horizon; T steps of an episode
-        Why       after a while most failures are in a few sequences, and a uniform draw spends its steps on the others
+                  with `retry` that share of episodes starts RETRY steps before a place where one failed of late
+        Why       after a while most failures are in a few sequences, and a uniform draw spends its steps on the others;
+                  within them they are at a few places, such as the first steps of a run
         Returns   (len(ids),) frames
-        Test      tests/test_env.py::test_balanced_starts
+        Test      tests/test_env.py::test_balanced_starts, test_retried_starts
         """
-        if not self.balance:
-            return self.rng.choice(self.starts, len(ids))
+        f = self._balanced(len(ids)) if self.balance else self.rng.choice(self.starts, len(ids))
+        if not self.retry:
+            return f
+        place = self.lost[self.rng.integers(PLACES, size=len(ids))]
+        before = place - self.rng.integers(*RETRY, size=len(ids))
+        again = (self.rng.random(len(ids)) < self.retry) & (place > 0)
+        return np.where(again, np.maximum(before, self.ref.first[self.owner[place]] + 1), f)
+
+    def _balanced(self, n):
         frames = self.ref.last - self.ref.first - 1  # that can be started from
         h = np.maximum(self.failed / self.lived, 1e-6)
         p = frames * (1.0 + h / np.average(h, weights=frames)) * h / -np.expm1(-h * self.horizon)
         cdf = np.cumsum(p)
-        k = np.searchsorted(cdf, cdf[-1] * self.rng.random(len(ids)), side="right")
-        return self.ref.first[k] + 1 + (frames[k] * self.rng.random(len(ids))).astype(int)
+        k = np.searchsorted(cdf, cdf[-1] * self.rng.random(n), side="right")
+        return self.ref.first[k] + 1 + (frames[k] * self.rng.random(n)).astype(int)
 
     def _count(self, done, terminated):
-        """Failures and steps lived of each sequence; of the past nine tenths remain with every episode's end.
+        """Failures and steps lived of each sequence, of the past nine tenths remain with every episode's end; and the
+        frames of the failures, each in the place of any earlier one.
 
-        Test      tests/test_env.py::test_balanced_starts"""
+        Test      tests/test_env.py::test_balanced_starts, test_retried_starts"""
+        if self.retry:
+            frames = self.frame[done][terminated[done]]
+            self.lost[self.rng.integers(PLACES, size=len(frames))] = frames
         k, sequences = self.sequence[done], len(self.failed)
         kept = 0.9 ** np.bincount(k, minlength=sequences)
         self.failed[:] = kept * self.failed + np.bincount(k, terminated[done], sequences)
@@ -539,7 +556,7 @@ class Env:
         if len(done):
             info["final_critic"] = self.full.copy()
             info["final_obs"] = info["final_critic"][:, : self.obs_size]
-            if self.balance:
+            if self.balance or self.retry:
                 self._count(done, terminated)
             self._reset(done)
             self._observe(done)
@@ -646,6 +663,7 @@ class Env:
 
         Test      tests/test_env.py::test_state_continues_exactly, tests/test_ppo.py::test_resume_is_exact"""
         names = ("frame", "steps", "available", "action", "sensor_error", "failed", "lived")
+        names += ("lost",) if self.retry else ()
         arrays = {k: getattr(self, k).copy() for k in names}
         return {"state": self.batch.state.copy()} | arrays, {"rng": rng_state(self.rng)}
 
@@ -661,12 +679,15 @@ class Env:
                 raise ValueError(f"env.{name} is {have.dtype} {have.shape}, expected finite {need.dtype} {need.shape}")
             if name not in ("state", "action", "sensor_error") and have.min(initial=0) < 0:
                 raise ValueError(f"env.{name} is negative")
-        if arrays["frame"].max() >= len(self.ref):
-            raise ValueError(f"env.frame is beyond the motions' {len(self.ref)} frames")
+        for name in ("frame", "lost") if self.retry else ("frame",):
+            if arrays[name].max() >= len(self.ref):
+                raise ValueError(f"env.{name} is beyond the motions' {len(self.ref)} frames")
         self.batch.state[:] = arrays["state"]
         self.frame[:], self.steps[:], self.action[:] = arrays["frame"], arrays["steps"], arrays["action"]
         self.available[:] = arrays["available"]
         self.sensor_error[:], self.failed[:], self.lived[:] = (arrays[k] for k in ("sensor_error", "failed", "lived"))
+        if self.retry:
+            self.lost[:] = arrays["lost"]
         self.sequence[:] = self.owner[self.frame]
         self.rng = rng_from_state(meta["rng"])
         self.refresh()

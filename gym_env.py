@@ -61,8 +61,8 @@ CLEANRL = dict(  # [Huang22] ppo_continuous_action.py; Adam's epsilon and the cl
     norm_each_step=True, reward_norm=True,
 )  # fmt: skip
 OF_CHARACTERS = (  # options that mean nothing to a task
-    *(f.name for f in fields(character.Switches)), "motion", "clips", "joint_map", "unit", "up", "balance", "augment",
-    "sensor_offset", "sensor_noise", "push", "episode", "sensors", "without", "track",
+    *(f.name for f in fields(character.Switches)), "motion", "clips", "joint_map", "unit", "up", "balance", "retry",
+    "augment", "sensor_offset", "sensor_noise", "push", "episode", "sensors", "without", "track",
 )  # fmt: skip
 
 

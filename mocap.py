@@ -136,7 +136,7 @@ _BEARING = {"chest": (0.04, 0.10, 0.05), "head": (0.05, 0.12, 0.08), "upper_arm"
 _ELBOW = 0.5  # rad, standard deviation of a further bend, forward
 
 
-def restyle(clip: Clip, rng: np.random.Generator, swing=(0.5, 1.6), bearing=1.0) -> Clip:
+def restyle(clip: Clip, rng: np.random.Generator, swing=(0.1, 1.6), bearing=1.0) -> Clip:
     r"""The same steps with another bearing: trunk, head and arms carried otherwise, swung more or less.
 
     Equation  of a segment relative to its parent:  R' = exp(φ) R̄ exp(g log(R̄⁻¹ R)), R̄ its mean over the clip
@@ -179,7 +179,7 @@ def restyle(clip: Clip, rng: np.random.Generator, swing=(0.5, 1.6), bearing=1.0)
 
 def augment(
     clips: list[Clip], rng: np.random.Generator, speed=0.15, height=0.2, arms=0.2, trunk=(0.95, 1.45),
-    swing=(0.5, 1.6), bearing=1.0,
+    swing=(0.1, 1.6), bearing=1.0,
 ) -> list[Clip]:  # fmt: skip
     """Every clip, and its mirror image with another bearing at a random speed by a user of random height, arm and trunk
     length.

@@ -123,6 +123,9 @@ class Options(character.Switches):
         None, "below this the standard deviations do not fall: the character's, or 0.05", check=POSITIVE
     )
     balance: bool = arg(False, "start more often where episodes end soon, so that all motion is simulated equally long")
+    retry: float = arg(
+        0.0, "share of episodes that start up to 2 s before a place where one failed of late", check=UNIT
+    )
     augment: bool = arg(False, "also mirrored clips at other speeds, by users of other heights and arm lengths")
     sensor_offset: float = arg(0.0, "constant error of device positions in an episode [m]", check=NONNEGATIVE)
     sensor_noise: float = arg(0.0, "white noise on device positions [m]", check=NONNEGATIVE)
@@ -687,6 +690,7 @@ def make_env(opt: Options) -> Env | Task:
     return Env(
         char, headset_only(ref) if opt.sensors == "hmd" else ref, opt.envs, opt.seed, opt.threads, opt.episode,
         disturbance=disturbance, balance=opt.balance, asymmetric="asymmetric" not in opt.without,
+        retry=opt.retry,
     )  # fmt: skip
 
 

@@ -848,3 +848,40 @@ def test_balanced_starts(char):
     for _ in range(30):
         a = np.full((8, small.action_size), 0.1)
         np.testing.assert_array_equal(small.step(a)[0], other.step(a)[0])
+
+
+def test_retried_starts(char):
+    """A share of the episodes starts 3 to 59 steps before a remembered failure, in its sequence; the rest anywhere."""
+    clips = [c[:n] for c, n in zip(mocap.builtin_clips(), (151, 121, 211), strict=False)]
+    ref = retarget.reference(char, clips)
+    for balance in (False, True):
+        env = Env(char, ref, 4000, threads=1, retry=0.4, balance=balance)
+        plain = np.bincount(env._draw(np.arange(env.n)), minlength=len(ref))  # nothing has failed yet
+        assert plain[env.starts].min() > 0 and plain[env.starts].max() < 4 * env.n / len(env.starts)
+        env.lost[:] = ref.first[2] + 100
+        counts = np.bincount(env._draw(np.arange(env.n)), minlength=len(ref))
+        near = np.arange(ref.first[2] + 41, ref.first[2] + 98)
+        expected = 0.4 * env.n + 0.6 * env.n * len(near) / len(env.starts)
+        assert abs(counts[near].sum() - expected) < 0.05 * env.n and counts[near].min() > 0
+        assert set(np.flatnonzero(counts)) <= set(env.starts)
+        env.lost[:] = ref.first[1] + 10  # so soon that most starts would lie in the sequence before
+        counts = np.bincount(env._draw(np.arange(env.n)), minlength=len(ref))
+        assert set(np.flatnonzero(counts)) <= set(env.starts)
+        assert counts[ref.first[1] + 1] > 0.3 * env.n
+
+    small = Env(char, ref, 64, threads=1, seed=1, retry=0.5)
+    small.reset(1)
+    fell = set()
+    for _ in range(40):
+        where = small.frame.copy()
+        _, _, terminated, _, _ = small.step(np.zeros((64, small.action_size)))
+        fell |= set(where[terminated] + 1)
+    assert len(fell) > 20 and set(small.lost[small.lost > 0]) <= fell and np.sum(small.lost > 0) > 20
+    other = Env(char, ref, 64, threads=1, seed=5, retry=0.5)
+    other.load_state(*small.state())
+    for _ in range(30):
+        a = np.full((64, small.action_size), 0.1)
+        np.testing.assert_array_equal(small.step(a)[0], other.step(a)[0])
+    arrays, meta = small.state()
+    with pytest.raises(ValueError, match="env.lost is beyond"):
+        other.load_state(arrays | {"lost": arrays["lost"] + len(ref)}, meta)
