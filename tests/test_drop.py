@@ -417,6 +417,27 @@ def test_soft_correction_both_ways():
     np.testing.assert_allclose(drop.soft_correction(x, B, residual, 1e-6).ravel(), found.x, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "weight, force, roll, pitch, turn", [(1e-6, 0.95, 0.82, 0.81, 0.20), (5e-6, 0.99, 0.96, 0.96, 0.55)]
+)
+def test_what_the_correction_removes(weight, force, roll, pitch, turn):
+    """Of a unit wrench on someone standing, along each axis: what the comments of w_p say."""
+    B, _ = drop.wrench_map(STAND, np.zeros((N, 3)), np.zeros((N, 3)))
+    removed = [-(B @ (drop.soft_correction(STAND, B, e, weight) - STAND).ravel())[i] for i, e in enumerate(np.eye(6))]
+    np.testing.assert_allclose(removed, [force] * 3 + [roll, pitch, turn], atol=0.01)
+
+
+def test_a_simulator_corrects_with_its_own_weight():
+    """A larger w_p leaves less of the root wrench of a step, bones not restored."""
+    left = []
+    for weight in (1e-8, 1e-6, 1e-4):
+        sim = Simulator(prior(), restore=False, wrench_limit=0.0, wrench_weight=weight)
+        force = np.zeros((N, 3))
+        force[J["spine3"], 1] = 150.0
+        left.append(sim.step(state_of(sim), force)[1].wrench)
+    assert left[2] < 0.3 * left[1] < 0.3 * left[0]
+
+
 # ------------------------------------------------------------------------------------ the step
 
 
@@ -854,6 +875,7 @@ def test_bad_settings():
         ({"samples": True}, "samples True"), ({"iterations": 0}, "iterations 0"), ({"inside": "x"}, "always, never"),
         ({"obstacles": ()}, "no obstacles"), ({"weights": Weights(contact=-1.0)}, "contact -1"),
         ({"weights": Weights(prior=np.nan)}, "prior nan"), ({"wrench_limit": -1.0}, "wrench_limit -1"),
+        ({"wrench_weight": 0.0}, "wrench_weight 0"), ({"wrench_weight": np.inf}, "wrench_weight inf"),
         ({"springs": ((0, 99, 1.0, 1.0),)}, "joints of 0 to 21"), ({"springs": ((0, 7, 1.0, np.nan),)}, "spring"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=words):
