@@ -527,10 +527,12 @@ def _trip(stage, rng, speed, hold=30):
 
 
 def tilt(stage, rng):
-    """§8.2: the platform under a walker tilts about the axis it walks along, 10 degrees a second to 15; and uphill."""
+    """§8.2: the platform under a walker tilts about the axis it walks along, 10 degrees a second to 15; and uphill.
+
+    Test      tests/test_drop_demos.py::test_a_tilted_walker_walks_on"""
     takes = []
     for axis, word in ((np.array([1.0, 0, 0]), "sideways"), (np.array([0, -1.0, 0]), "uphill")):
-        sim, state = stage.start(1.0, place=(0.0, 0.0))
+        sim, state = stage.start(1.2, place=(0.0, 0.0))
         pivot = np.array([0.6, 0.0, 0.0])
 
         def act(t, state, axis=axis, pivot=pivot, sim=sim):
