@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 import drop_vae as vae
-from drop import LENGTHS, OFFSETS, PARENTS, PATH, STEP, J, N, align, forward_kinematics, swing_twist, twists
+from drop import LENGTHS, OFFSETS, PARENTS, PATH, STANDING, STEP, J, N, align, forward_kinematics, swing_twist, twists
 from human import heading, quat_conj, quat_mul
 from runs import UserError, load_checkpoint, run_main
 
@@ -221,19 +221,28 @@ class VaePrior:
               answer goes back on the slope (`incline`)
     Args      net : drop_vae.MotionVAE; floor : Plane under the character or None; velocity : "own" (§7: what the prior
               itself predicted) or "solved" (differences of the solved positions); spread : standard deviation of the
-              angle [rad] by which samples, not the mode, are turned about the pelvis, as NearestPrior's are
-    ASSUMED   spread 0, and 0.3 where a direction leads (drop_demos.follow): trained on few turns, z alone does not turn
+              angle [rad] by which samples, not the mode, are turned about the pelvis, as NearestPrior's are; down :
+              share of the standing pelvis's height; a body with its pelvis below that, or its neck below its pelvis,
+              gets no samples: a rag doll, because trained on people upright the network drags it along (§8.7); 0 never
+    ASSUMED   down 0.6; spread 0, and 0.3 where a direction leads (drop_demos.follow): trained on few turns, z alone
+              does not turn
     Test      tests/test_drop_vae.py::test_vae_prior
     """
 
-    def __init__(self, net, floor=None, velocity="own", spread=0.0):
+    def __init__(self, net, floor=None, velocity="own", spread=0.0, down=0.6):
         if velocity not in ("own", "solved"):
             raise ValueError(f"velocity {velocity!r}: valid are own, solved")
-        self.net, self.floor, self.velocity, self.spread = net, floor, velocity, spread
+        self.net, self.floor, self.velocity, self.spread, self.down = net, floor, velocity, spread, down
         self._mode = None
 
     def sample(self, state, n, rng):
-        """n samples; without rng the mode alone."""
+        """n samples; without rng the mode alone; of a body that is down none."""
+        height, trunk = state.x[0, 2] - ground(self.floor, state.x), state.x[J["neck"], 2] - state.x[0, 2]
+        if height < self.down * STANDING or (trunk < 0.0 and self.down):
+            return np.zeros((0, N, 3)), np.zeros((0, N, 4))
+        return self._decoded(state, n, rng)
+
+    def _decoded(self, state, n, rng):
         net, given, inclined = self.net, state, sloping(self.floor)
         if inclined:
             state = level_state(self.floor, state)
@@ -268,7 +277,7 @@ class VaePrior:
     def mode(self, state):
         """The prior's mean latent, decoded."""
         if self._mode is None or self._mode[0] is not state:
-            self.sample(state, 0, None)
+            self._decoded(state, 0, None)
         return self._mode[1:]
 
 

@@ -315,6 +315,17 @@ def test_the_tripped_stumble(all_clips, monkeypatch):
     assert numbers(stiff.notes["stumble"])[1] < 12
 
 
+@pytest.mark.parametrize("down, low, high", [(0.6, 0.0, 0.5), (0.0, 1.0, 9.0)])
+def test_who_lies_is_not_dragged(down, low, high, all_clips, monkeypatch):
+    """A tripped runner of the learned prior comes to rest; asked in spite of lying, the prior drags it on (§8.7)."""
+    monkeypatch.setattr(all_clips, "general", demos.VaePrior(demos.load_networks()[0], down=down))
+    monkeypatch.setattr(all_clips.opt, "prior", "vae")
+    run = demos._trip(all_clips, np.random.default_rng(0), 2.5)
+    assert demos.measure(run)[0]["end"] == "fell"
+    speed = float(re.search(r"([\d.]+) at the end", run.notes["stumble"])[1])
+    assert low <= speed < high
+
+
 @pytest.mark.parametrize(
     "clips, prior, slide", [("all", "nearest", 0.15), ("few", "nearest", 0.3), ("all", "vae", 0.4)]
 )

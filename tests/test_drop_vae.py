@@ -433,6 +433,13 @@ def test_vae_prior():
     x = climbing.sample(on_slope, 4, RNG(0))[0]
     np.testing.assert_allclose(np.linalg.norm(drop.DIFFERENCE @ x, axis=-1), np.tile(LENGTHS, (4, 1)), rtol=2e-6)
     assert np.abs(climbing.mode(state)[0] - mode).max() > 0.05
+    lying = State((state.x - state.x[0]) @ Rotation.from_euler("y", 85, degrees=True).as_matrix().T + [0, 0, 0.2],
+                  state.v, state.quat)  # fmt: skip
+    head_down = State(state.x * [1, 1, -1] + [0, 0, 2.0], state.v, state.quat)
+    for down in (lying, head_down):
+        assert len(prior.sample(down, 4, RNG(0))[0]) == 0 and len(prior.sample(down, 4, None)[0]) == 0
+        assert prior.mode(down)[0].shape == (N, 3)
+        assert len(VaePrior(shipped()[0], down=0.0).sample(down, 4, RNG(0))[0]) == 4
     own = State(state.x, state.v, state.quat, 0, 0 * state.v)
     assert np.abs(prior.mode(own)[0] - mode).max() > 1e-3  # the prior's own velocities are what it sees
     np.testing.assert_allclose(VaePrior(shipped()[0], velocity="solved").mode(own)[0], mode, atol=1e-6)
