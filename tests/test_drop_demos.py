@@ -307,12 +307,12 @@ def test_the_tripped_stumble(all_clips, monkeypatch):
         slowest = float(re.search(r"([\d.]+) at the least", walk.notes["stumble"])[1])
         assert slowest < 0.8
         leans.append(numbers(walk.notes["stumble"])[1])
-    assert min(leans) > 18 and max(leans) > 60, leans
+    assert min(leans) > 12 and max(leans) > 60, leans  # 24 seeds: 16 to 177 degrees, 19 of them above 90
     run = demos._trip(all_clips, np.random.default_rng(0), 2.5)
     assert demos.measure(run)[0]["end"] == "fell"
     monkeypatch.setattr(demos, "TRIP_WEIGHT", drop.WRENCH_WEIGHT)
     stiff = demos._trip(all_clips, np.random.default_rng(0), 1.2)
-    assert numbers(stiff.notes["stumble"])[1] < 12
+    assert numbers(stiff.notes["stumble"])[1] < 10
 
 
 @pytest.mark.parametrize("down, low, high", [(0.6, 0.0, 0.5), (0.0, 1.0, 9.0)])
