@@ -262,7 +262,9 @@ WRENCH_MARGIN = 0.03  # m, ASSUMED: a sphere this near to an obstacle may carry 
 # built-in walks have medians of 4 to 8 themselves.  Runs have 14 to 20, and 42 to 58 in a twentieth of their frames:
 # drop_demos.Stage gives them that (`wrench_limit`).
 WRENCH_LIMIT = 15.0
-WRENCH_WEIGHT = 1e-6  # w_p of Eq. 14, ASSUMED: removes 95 % of a residual force, 60 to 80 % of a torque
+# w_p of Eq. 14, ASSUMED: of someone standing it removes 95 % of a residual force, 81 % of a torque that pitches or
+# rolls, 20 % of one that turns about the vertical
+WRENCH_WEIGHT = 1e-6
 
 
 def momentum_rate(x, x_t, v_t, h=STEP):
@@ -424,7 +426,7 @@ class Simulator:
               contact, limits, correction : §8.3's switches; limits may be another projection (x, twist) -> x_r
               restore : bone lengths made exact at the end of a step
               springs : ((joint, joint, length [m], weight), …), such as a stiff knee's
-              wrench_limit : the root wrench below which nothing is corrected [N, N m]
+              wrench_limit : the root wrench below which nothing is corrected [N, N m]; wrench_weight : w_p of Eq. 14
               inside : does E_3 take part while the pose is inside its limits, where p = x: "always", "never", or
               "free", only where the prior alone drives (neither v_tar nor pins, and there are samples)
     ASSUMED   `restore`; only the part of the root wrench above `wrench_limit` is corrected (§8.5: down to mocap's
@@ -436,7 +438,7 @@ class Simulator:
 
     def __init__(self, prior=None, obstacles=(Plane(),), weights=None, samples=16, iterations=ITERATIONS, start="mode",
                  prior_at_first=False, contact=True, limits=project_range_of_motion, correction=True, restore=True,
-                 springs=(), wrench_limit=WRENCH_LIMIT, inside="free"):  # fmt: skip
+                 springs=(), wrench_limit=WRENCH_LIMIT, wrench_weight=WRENCH_WEIGHT, inside="free"):  # fmt: skip
         for name, value, valid in (("start", start, ("mode", "y")), ("inside", inside, ("always", "never", "free"))):
             if value not in valid:
                 raise ValueError(f"{name} {value!r}: valid are {', '.join(valid)}")
@@ -451,8 +453,10 @@ class Simulator:
             raise ValueError(f"weights: {', '.join(bad)}; they must be 0 or more, and finite")
         if not wrench_limit >= 0:
             raise ValueError(f"wrench_limit {wrench_limit}: it must be 0 or more")
+        if not 0 < wrench_weight < np.inf:
+            raise ValueError(f"wrench_weight {wrench_weight}: it must be above 0, and finite")
         gaps(np.zeros((N, 3)), self.obstacles)  # complains if there are none
-        self.wrench_limit, self.inside = wrench_limit, inside
+        self.wrench_limit, self.wrench_weight, self.inside = wrench_limit, wrench_weight, inside
         self.samples, self.iterations, self.start, self.prior_at_first = samples, iterations, start, prior_at_first
         self.contact, self.limits, self.correction, self.restore = contact, limits, correction, restore
         ends = np.array([[a, b] for a, b, _, _ in springs], int).reshape(-1, 2)
@@ -553,7 +557,7 @@ class Simulator:
         c, residual = contact_forces(F, B @ x.ravel() - a)
         wrench_pd = float(np.sqrt(residual @ residual))
         if self.correction and choice >= 0 and wrench_pd > self.wrench_limit:  # only what is above the limit
-            x = soft_correction(x, B, residual * (1.0 - self.wrench_limit / wrench_pd))
+            x = soft_correction(x, B, residual * (1.0 - self.wrench_limit / wrench_pd), self.wrench_weight)
         bone_error = float(np.abs(_lengths(x) / LENGTHS - 1).max())
         if self.restore:
             anchor = 1.0 + w.contact * active

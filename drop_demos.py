@@ -480,13 +480,21 @@ def constrain(stage, rng):
     return takes
 
 
+TRIP_WEIGHT = 5e-6  # w_p of Eq. 14 in a trip, ASSUMED: takes 95 % of a pitching torque away, as the default of a force
+
+
 def trip(stage, rng):
-    """§8.2: the left heel of a walker and of a runner held for 1 s, caught as it swings past the other foot."""
+    """§8.2: the left heel of a walker and of a runner held for 1 s, caught as it swings past the other foot.
+
+    ASSUMED   TRIP_WEIGHT.  The default leaves a fifth of the torque by which the prior holds the trunk upright, enough
+              for a tripped walker to stop and stand; with 1e-5 everywhere all who follow a direction fall in turns
+    Test      tests/test_drop_demos.py::test_the_tripped_stumble
+    """
     return [_trip(stage, stage.again(), speed) for speed in (1.2, 2.5)]
 
 
 def _trip(stage, rng, speed, hold=30):
-    sim, state = stage.start(speed)
+    sim, state = stage.start(speed, wrench_weight=TRIP_WEIGHT)
     held = {}
 
     def act(t, state):
@@ -519,10 +527,12 @@ def _trip(stage, rng, speed, hold=30):
 
 
 def tilt(stage, rng):
-    """§8.2: the platform under a walker tilts about the axis it walks along, 10 degrees a second to 15; and uphill."""
+    """§8.2: the platform under a walker tilts about the axis it walks along, 10 degrees a second to 15; and uphill.
+
+    Test      tests/test_drop_demos.py::test_a_tilted_walker_walks_on"""
     takes = []
     for axis, word in ((np.array([1.0, 0, 0]), "sideways"), (np.array([0, -1.0, 0]), "uphill")):
-        sim, state = stage.start(1.0, place=(0.0, 0.0))
+        sim, state = stage.start(1.2, place=(0.0, 0.0))
         pivot = np.array([0.6, 0.0, 0.0])
 
         def act(t, state, axis=axis, pivot=pivot, sim=sim):

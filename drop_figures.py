@@ -336,8 +336,12 @@ class Detector:
 
 
 def failures(opt):
-    """python drop.py failures: pushed over, and what finds it.  Test: tests/test_drop_figures.py::test_failures"""
+    """python drop.py failures: pushed over, and what finds it.  The learned prior is asked though the body lies.
+
+    Test: tests/test_drop_figures.py::test_failures"""
     stage = demos.Stage(opt)
+    if opt.prior == "vae":
+        stage.general.down = 0.0
     detect, takes = Detector.calibrated(stage.clips), []
     for name, speed, newton in (("walk", 1.2, 0.0), ("walk pushed over", 1.2, 300.0), ("run pushed over", 2.5, 300.0)):
         sim, state = stage.start(speed)

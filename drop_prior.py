@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 import drop_vae as vae
-from drop import OFFSETS, PARENTS, PATH, STEP, J, N, align, forward_kinematics, swing_twist, twists
+from drop import LENGTHS, OFFSETS, PARENTS, PATH, STANDING, STEP, J, N, align, forward_kinematics, swing_twist, twists
 from human import heading, quat_conj, quat_mul
 from runs import UserError, load_checkpoint, run_main
 
@@ -120,7 +120,7 @@ class NearestPrior:
     @floor.setter
     def floor(self, plane):
         self._floor, self._last, self._mode, self._level = plane, None, None, None  # found over another floor: void
-        self._sloping = plane is not None and plane.normal[2] < 1.0 - 1e-9
+        self._sloping = sloping(plane)
 
     def features(self, x, v, quat):
         """(T, 72) features whose distances are RMS metres a joint.  x, v (T, 22, 3), quat (T, 22, 4)."""
@@ -132,8 +132,8 @@ class NearestPrior:
         return turned.reshape(len(x), -1) / np.sqrt(len(MATCHED))
 
     def ground(self, x):
-        """Height of the floor under the pelvis of x (22, 3) [m]."""
-        return ground(self.floor, x)
+        """Height of the floor under the pelvis of x (22, 3) [m]; 0 on a slope, where states are levelled first."""
+        return 0.0 if self._sloping else ground(self.floor, x)
 
     def nearest(self, state, n):
         """Numbers of the n nearest frames, nearest first, and the distance of the nearest [m]."""
@@ -202,9 +202,7 @@ class NearestPrior:
         return self._level[1]
 
     def _sloped(self, x, quat):
-        if self._sloping:
-            x[..., 2] += slope(self.floor, x)
-        return x, quat
+        return (incline(self.floor, x) if self._sloping else x), quat
 
     def _nearest(self, state, n):
         if self._last is None or self._last[0] is not state or len(self._last[1]) < min(n, len(self.norm)):
@@ -219,24 +217,36 @@ class VaePrior:
     r"""The conditional VAE of drop_vae.py as a prior  [DROP Eqs. 8, 9].
 
     Equation  z ~ N(μ0(s), σ0(s)²) for the set of samples, z = μ0(s) for the mode; x̃ by forward kinematics of the
-              decoded rotations
+              decoded rotations; on a slope the network is shown the state on the level (`level_state`), and its
+              answer goes back on the slope (`incline`)
     Args      net : drop_vae.MotionVAE; floor : Plane under the character or None; velocity : "own" (§7: what the prior
               itself predicted) or "solved" (differences of the solved positions); spread : standard deviation of the
-              angle [rad] by which samples, not the mode, are turned about the pelvis, as NearestPrior's are
-    ASSUMED   spread 0, and 0.3 where a direction leads (drop_demos.follow): trained on few turns, z alone does not turn
+              angle [rad] by which samples, not the mode, are turned about the pelvis, as NearestPrior's are; down :
+              share of the standing pelvis's height; a body with its pelvis below that, or its neck below its pelvis,
+              gets no samples: a rag doll, because trained on people upright the network drags it along (§8.7); 0 never
+    ASSUMED   down 0.6; spread 0, and 0.3 where a direction leads (drop_demos.follow): trained on few turns, z alone
+              does not turn
     Test      tests/test_drop_vae.py::test_vae_prior
     """
 
-    def __init__(self, net, floor=None, velocity="own", spread=0.0):
+    def __init__(self, net, floor=None, velocity="own", spread=0.0, down=0.6):
         if velocity not in ("own", "solved"):
             raise ValueError(f"velocity {velocity!r}: valid are own, solved")
-        self.net, self.floor, self.velocity, self.spread = net, floor, velocity, spread
+        self.net, self.floor, self.velocity, self.spread, self.down = net, floor, velocity, spread, down
         self._mode = None
 
     def sample(self, state, n, rng):
-        """n samples; without rng the mode alone."""
-        net = self.net
-        lift = np.array([0.0, 0.0, ground(self.floor, state.x)])
+        """n samples; without rng the mode alone; of a body that is down none."""
+        height, trunk = state.x[0, 2] - ground(self.floor, state.x), state.x[J["neck"], 2] - state.x[0, 2]
+        if height < self.down * STANDING or (trunk < 0.0 and self.down):
+            return np.zeros((0, N, 3)), np.zeros((0, N, 4))
+        return self._decoded(state, n, rng)
+
+    def _decoded(self, state, n, rng):
+        net, given, inclined = self.net, state, sloping(self.floor)
+        if inclined:
+            state = level_state(self.floor, state)
+        lift = np.array([0.0, 0.0, 0.0 if inclined else ground(self.floor, state.x)])
         v = state.v if self.velocity == "solved" or state.v_own is None else state.v_own
         here = state.x - lift - state.x[0] * [1, 1, 0]
         one = [np.asarray(a, np.float32)[None] for a in (here, vae.columns_of(state.quat), v)]
@@ -259,13 +269,15 @@ class VaePrior:
         root = np.matmul(spin, out[:, 0, :, None].astype(float))[..., 0] + state.x[0] * [1, 1, 0] + lift
         quat = vae.quat_of(R)
         found = root[:, None] + PATH @ bones
-        self._mode = state, found[0], quat[0]
+        if inclined:
+            found = incline(self.floor, found)
+        self._mode = given, found[0], quat[0]
         return (found[1:], quat[1:]) if rng is not None else (found, quat)
 
     def mode(self, state):
         """The prior's mean latent, decoded."""
         if self._mode is None or self._mode[0] is not state:
-            self.sample(state, 0, None)
+            self._decoded(state, 0, None)
         return self._mode[1:]
 
 
@@ -316,45 +328,69 @@ class PoseRange:
         return out @ align(out[None], (x - centre)[None])[0].T + centre
 
 
-ANKLES = [J["ankle_l"], J["ankle_r"]]
-# How far a joint follows the floor's slope: feet wholly, knees half, so that the trunk stays upright.  ASSUMED
-SLOPED = np.zeros(N)
-for _name, _share in (("knee", 0.5), ("ankle", 1.0), ("foot", 1.0)):
-    SLOPED[[J[f"{_name}_l"], J[f"{_name}_r"]]] = _share
+LEGS = np.array([[J[f"{name}_{side}"] for side in "lr"] for name in ("hip", "knee", "ankle", "foot")])
 
 
-def slope(floor, x):
-    r"""What a sloping floor adds to the height of each joint of a body on a level one.
+def incline(floor, x, down=False):
+    r"""A body on the floor z = 0 put on a sloping one, or back: feet follow it, knees bend, bones keep their lengths.
 
-    Equation  r_j = −(n_xy · (x_j − x_0)_xy) / n_z, the floor's height under joint j less that under the pelvis;
-              Δz_j = s_j r_j + (1 − s_j) min(r of the ankles, 0), s = SLOPED: the trunk sinks as far as the lower foot
-    ASSUMED   recordings are of level floors; a body on a slope is one on a level floor, its legs sheared
-    Args      floor : Plane; x : (..., 22, 3) [m], of which only x and y are read: the inverse subtracts the same
-    Returns   (..., 22) [m]
-    Test      tests/test_drop.py::test_slope
+    Equation  g + r_j = the floor's height under joint j, g under the pelvis: r_j = −(n_xy · (x_j − x_0)_xy) / n_z.
+              Ankles go up by g + r, all from the hips up by g + min(r of the ankles, 0), so that no leg has to grow;
+              the foot's bone is sheared by the slope and keeps its length; the knee bends in the plane it had, turned
+              with the line from hip to ankle, by the law of cosines.  down: the same with −g, −r, which undoes it
+    ASSUMED   recordings are of level floors; on a slope the trunk stays upright and hangs from the lower foot
+    Args      floor : Plane; x : (..., 22, 3) [m], world
+    Returns   (..., 22, 3) [m]
+    Test      tests/test_drop.py::test_incline
     """
+    sign, out = (-1.0 if down else 1.0), x.copy()
+    dot = lambda a, b: np.einsum("...i,...i", a, b)[..., None]  # noqa: E731
+    unit = lambda a: a / np.maximum(np.sqrt(dot(a, a)), 1e-9)  # noqa: E731
+    l1, l2, l3 = (LENGTHS[row - 1][:, None] for row in LEGS[1:])  # (2, 1), left and right
     rise = (x[..., :1, :2] - x[..., :2]) @ floor.normal[:2] / floor.normal[2]
-    low = np.minimum(rise[..., ANKLES].min(axis=-1), 0.0)[..., None]
-    return SLOPED * rise + (1.0 - SLOPED) * low
+    low = np.minimum(rise[..., LEGS[2]].min(axis=-1), 0.0)[..., None]
+    out[..., 2] += sign * (ground(floor, x)[..., None] + low)
+    hip, knee, ankle, foot = (x[..., row, :] for row in LEGS)
+    leg, bone = ankle - hip, foot - ankle
+    u, v = unit(leg), leg.copy()
+    v[..., 2] += sign * (rise[..., LEGS[2]] - low)
+    bone[..., 2] += sign * (rise[..., LEGS[3]] - rise[..., LEGS[2]])
+    bone = l3 * unit(bone)
+    reach, v = np.clip(np.sqrt(dot(v, v)), abs(l1 - l2) + 1e-6, l1 + l2 - 1e-6), unit(v)
+    side = knee - hip + 0.01 * unit(foot - ankle)  # a straight knee bends towards the toes
+    side = side - dot(side, u) * u
+    side = unit(side - dot(side, v) / np.maximum(1.0 + dot(u, v), 1e-9) * (u + v))  # turned as u to v
+    cosine = (l1 * l1 + reach * reach - l2 * l2) / (2.0 * l1 * reach)
+    hip = out[..., LEGS[0], :]
+    out[..., LEGS[1], :] = hip + l1 * (cosine * v + np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0)) * side)
+    out[..., LEGS[2], :] = hip + reach * v
+    out[..., LEGS[3], :] = hip + reach * v + bone
+    return out
 
 
 def level_state(floor, state):
-    """The State as it would be on a level floor as high as the slope under the pelvis: `slope` undone, as it was a
-    step ago too; so its velocities do not climb.
+    r"""The State as it would be on the floor z = 0.
 
-    Test: tests/test_drop.py::test_slope"""
-    before = state.x - STEP * state.v
-    rise = [slope(floor, p) + ground(floor, p) for p in (before, state.x)]
-    x, v = state.x.copy(), state.v.copy()
-    x[:, 2] -= slope(floor, x)
-    v[:, 2] -= (rise[1] - rise[0]) / STEP
-    quat = vae.quat_of(swing_twist(x, twists(state.quat))[0])
-    return replace(state, x=x, v=v, quat=quat)
+    Equation  x = L(x), L = `incline` down; v = (L(x) − L(x − h v))/h, the prior's own velocities likewise: they do not
+              climb
+    Test      tests/test_drop.py::test_incline
+    """
+    x = incline(floor, state.x, down=True)
+    v, own = (
+        None if u is None else (x - incline(floor, state.x - STEP * u, down=True)) / STEP
+        for u in (state.v, state.v_own)
+    )
+    return replace(state, x=x, v=v, v_own=own, quat=vae.quat_of(swing_twist(x, twists(state.quat))[0]))
 
 
 def ground(floor, x):
-    """Height of a floor (Plane or None) under the pelvis of x (22, 3) [m]."""
-    return 0.0 if floor is None else (floor.offset - floor.normal[:2] @ x[0, :2]) / floor.normal[2]
+    """Height of a floor (Plane or None) under the pelvis of x (..., 22, 3) [m]."""
+    return 0.0 if floor is None else (floor.offset - x[..., 0, :2] @ floor.normal[:2]) / floor.normal[2]
+
+
+def sloping(floor):
+    """Is there a floor (Plane or None) that is not level?"""
+    return floor is not None and floor.normal[2] < 1.0 - 1e-9
 
 
 @functools.cache

@@ -417,6 +417,27 @@ def test_soft_correction_both_ways():
     np.testing.assert_allclose(drop.soft_correction(x, B, residual, 1e-6).ravel(), found.x, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "weight, force, roll, pitch, turn", [(1e-6, 0.95, 0.82, 0.81, 0.20), (5e-6, 0.99, 0.96, 0.96, 0.55)]
+)
+def test_what_the_correction_removes(weight, force, roll, pitch, turn):
+    """Of a unit wrench on someone standing, along each axis: what the comments of w_p say."""
+    B, _ = drop.wrench_map(STAND, np.zeros((N, 3)), np.zeros((N, 3)))
+    removed = [-(B @ (drop.soft_correction(STAND, B, e, weight) - STAND).ravel())[i] for i, e in enumerate(np.eye(6))]
+    np.testing.assert_allclose(removed, [force] * 3 + [roll, pitch, turn], atol=0.01)
+
+
+def test_a_simulator_corrects_with_its_own_weight():
+    """A larger w_p leaves less of the root wrench of a step, bones not restored."""
+    left = []
+    for weight in (1e-8, 1e-6, 1e-4):
+        sim = Simulator(prior(), restore=False, wrench_limit=0.0, wrench_weight=weight)
+        force = np.zeros((N, 3))
+        force[J["spine3"], 1] = 150.0
+        left.append(sim.step(state_of(sim), force)[1].wrench)
+    assert left[2] < 0.3 * left[1] < 0.3 * left[0]
+
+
 # ------------------------------------------------------------------------------------ the step
 
 
@@ -763,8 +784,7 @@ def test_nearest_prior():
     assert len(p.sample(upside, 12, np.random.default_rng(0))[0]) == 0
     with pytest.raises(ValueError, match="three frames"):
         NearestPrior([(x[:2], quat[:2])])
-    slope = NearestPrior([motion()], floor=Plane(np.array([-0.1, 0, 1.0]) / np.hypot(0.1, 1), 0.0))
-    assert slope.ground(np.full((N, 3), 2.0)) == pytest.approx(0.2)
+    assert NearestPrior([motion()], floor=Plane(offset=0.2)).ground(np.full((N, 3), 2.0)) == pytest.approx(0.2)
 
 
 # ------------------------------------------------------------------------------------ what goes wrong
@@ -854,6 +874,7 @@ def test_bad_settings():
         ({"samples": True}, "samples True"), ({"iterations": 0}, "iterations 0"), ({"inside": "x"}, "always, never"),
         ({"obstacles": ()}, "no obstacles"), ({"weights": Weights(contact=-1.0)}, "contact -1"),
         ({"weights": Weights(prior=np.nan)}, "prior nan"), ({"wrench_limit": -1.0}, "wrench_limit -1"),
+        ({"wrench_weight": 0.0}, "wrench_weight 0"), ({"wrench_weight": np.inf}, "wrench_weight inf"),
         ({"springs": ((0, 99, 1.0, 1.0),)}, "joints of 0 to 21"), ({"springs": ((0, 7, 1.0, np.nan),)}, "spring"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=words):
@@ -910,25 +931,51 @@ def test_nearest_prior_sees_a_new_floor():
     assert np.abs(p.mode(state)[0] - level).max() > 0.01
 
 
-def test_slope():
-    """Joint by joint from the plane's height; undone exactly; feet are as far from the plane as from a level floor."""
-    from drop_prior import ANKLES, SLOPED, level_state, slope
+def test_incline():
+    """Ankles are as far above the slope as they were above the floor; nothing is stretched; undone; velocities too."""
+    from drop_prior import incline, level_state
 
-    floor = Plane([-0.2, 0.15, 1.0], 0.3)
     x, quat = motion("walk")
-    x, v = x[60], (x[60] - x[59]) / STEP
-    height = lambda p: (floor.offset - floor.normal[:2] @ p[:2]) / floor.normal[2]  # noqa: E731
-    low = min(0.0, *(height(x[j]) - height(x[0]) for j in ANKLES))
-    wanted = [s * (height(p) - height(x[0])) + (1 - s) * low for s, p in zip(SLOPED, x)]
-    np.testing.assert_allclose(slope(floor, x), wanted, atol=1e-12)
-    np.testing.assert_allclose(slope(Plane(), x), 0.0, atol=1e-15)
-    lift = np.zeros_like(x)
-    lift[:, 2] = slope(floor, x)
-    level = level_state(floor, State(x + lift, v, quat[60]))
-    np.testing.assert_allclose(level.x, x, atol=1e-12)
-    np.testing.assert_allclose(drop.forward_kinematics(x[0], level.quat), x, atol=1e-9)
-    for j in drop.FEET:
-        assert (x + lift)[j, 2] - height(x[j]) == pytest.approx(x[j, 2] - height(x[0]), abs=1e-12)
+    x, quat = x[20:80], quat[20:80]
+    lengths = lambda p: np.linalg.norm(DIFFERENCE @ p, axis=-1)  # noqa: E731
+    for floor in (Plane([-0.27, 0.0, 1.0], 0.3), Plane([0.2, 0.15, 1.0], 0.3)):
+        height = lambda p: (floor.offset - p[..., :2] @ floor.normal[:2]) / floor.normal[2]  # noqa: B023, E731
+        y = incline(floor, x)
+        np.testing.assert_allclose(lengths(y), np.tile(LENGTHS, (60, 1)), atol=1e-9)
+        ankles, feet = [J["ankle_l"], J["ankle_r"]], [J["foot_l"], J["foot_r"]]
+        np.testing.assert_allclose((y[..., 2] - height(y))[:, ankles], x[:, ankles, 2], atol=1e-9)
+        np.testing.assert_allclose((y[..., 2] - height(y))[:, feet], x[:, feet, 2], atol=0.02)
+        low = np.array([min(0.0, *(height(p[a]) - height(p[0]) for a in ankles)) for p in x])
+        np.testing.assert_allclose(y[:, 0, 2], x[:, 0, 2] + height(x[:, 0]) + low, atol=1e-9)
+        trunk = [j for j in range(N) if not drop.JOINTS[j].startswith(("knee", "ankle", "foot"))]
+        np.testing.assert_allclose((y - y[:, :1])[:, trunk], (x - x[:, :1])[:, trunk], atol=1e-9)
+        for side in "lr":  # a knee is before the line from hip to ankle, as the toes are
+            hip, knee, ankle, foot = (y[:, J[f"{n}_{side}"]] for n in ("hip", "knee", "ankle", "foot"))
+            assert np.sum((knee - 0.5 * (hip + ankle)) * (foot - ankle), axis=1).min() > -1e-3
+        np.testing.assert_allclose(incline(floor, y, down=True), x, atol=2e-3)
+        state = State(y[40], (y[40] - y[39]) / STEP, quat[40], 0, (y[40] - y[39]) / STEP)
+        level = level_state(floor, state)
+        np.testing.assert_allclose(level.x, x[40], atol=2e-3)
+        np.testing.assert_allclose(level.v, (x[40] - x[39]) / STEP, atol=0.05)
+        np.testing.assert_array_equal(level.v, level.v_own)
+        np.testing.assert_allclose(drop.forward_kinematics(level.x[0], level.quat), level.x, atol=2e-2)
+    np.testing.assert_allclose(incline(Plane(offset=0.3), x), x + [0, 0, 0.3], atol=2e-3)
+    folded = np.zeros((N, 3))
+    assert np.isfinite(incline(floor, folded)).all() and np.isfinite(incline(floor, -x, down=True)).all()
+
+
+def test_a_prior_on_a_slope_is_the_prior_on_the_level():
+    """Nearest transitions: from a state put on a slope, the level answer put on it; bones are exact."""
+    from drop_prior import incline
+
+    x, quat = motion("walk")
+    floor = Plane([-0.27, 0.0, 1.0], 0.3)
+    y = incline(floor, x[59:61])
+    level, slope = prior(), NearestPrior([motion(), motion("stand"), motion("jog", speed=2.5)], floor=floor)
+    wanted = level.mode(State(x[60], (x[60] - x[59]) / STEP, quat[60]))[0]
+    got = slope.mode(State(y[1], (y[1] - y[0]) / STEP, quat[60]))[0]
+    np.testing.assert_allclose(got, incline(floor, wanted), atol=0.01)
+    np.testing.assert_allclose(np.linalg.norm(DIFFERENCE @ got, axis=-1), LENGTHS, atol=1e-9)
 
 
 def test_starting_under_the_floor():

@@ -425,6 +425,21 @@ def test_vae_prior():
     moved = State(state.x @ turn.as_matrix().T + shift + up, state.v @ turn.as_matrix().T, quats)
     raised = VaePrior(shipped()[0], Plane(offset=0.5))
     np.testing.assert_allclose(raised.mode(moved)[0], mode @ turn.as_matrix().T + shift + up, atol=1e-4)
+    floor = Plane([-0.27, 0.1, 1.0], 0.4)
+    up, before = (drop_prior.incline(floor, p) for p in (state.x, state.x - STEP * state.v))
+    climbing = VaePrior(shipped()[0], floor)
+    on_slope = State(up, (up - before) / STEP, state.quat)
+    np.testing.assert_allclose(climbing.mode(on_slope)[0], drop_prior.incline(floor, mode), atol=0.01)
+    x = climbing.sample(on_slope, 4, RNG(0))[0]
+    np.testing.assert_allclose(np.linalg.norm(drop.DIFFERENCE @ x, axis=-1), np.tile(LENGTHS, (4, 1)), rtol=2e-6)
+    assert np.abs(climbing.mode(state)[0] - mode).max() > 0.05
+    lying = State((state.x - state.x[0]) @ Rotation.from_euler("y", 85, degrees=True).as_matrix().T + [0, 0, 0.2],
+                  state.v, state.quat)  # fmt: skip
+    head_down = State(state.x * [1, 1, -1] + [0, 0, 2.0], state.v, state.quat)
+    for down in (lying, head_down):
+        assert len(prior.sample(down, 4, RNG(0))[0]) == 0 and len(prior.sample(down, 4, None)[0]) == 0
+        assert prior.mode(down)[0].shape == (N, 3)
+        assert len(VaePrior(shipped()[0], down=0.0).sample(down, 4, RNG(0))[0]) == 4
     own = State(state.x, state.v, state.quat, 0, 0 * state.v)
     assert np.abs(prior.mode(own)[0] - mode).max() > 1e-3  # the prior's own velocities are what it sees
     np.testing.assert_allclose(VaePrior(shipped()[0], velocity="solved").mode(own)[0], mode, atol=1e-6)
