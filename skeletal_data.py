@@ -613,7 +613,8 @@ def truth(m: Motion, target: Skeleton) -> Motion:
 
     Equation  p_e - p_b = (L_e^target / L_e^source) (p_e - p_b)^source, L_e the limb's length from b on.  For a foot b
               is the root and the root moves in the same ratio, so that feet stand where they stood: contacts are kept.
-              For a hand b is the limb's first joint (the bone before it turns with the trunk and cannot reach)
+              For a hand b is the limb's first joint (the bone before it turns with the trunk and cannot reach).  Ends
+              of limbs of fewer than three bones (a head on its neck) go where the copy has them: nothing can bend
     Method    start from `copy_rotations`, then IK a limb.  Feet keep their orientation: the goal is the ankle's
     Returns   Motion of the target
     Test      tests/test_skeletal_data.py::test_truth_keeps_ends_and_contacts
@@ -633,7 +634,8 @@ def truth(m: Motion, target: Skeleton) -> Motion:
             continue  # a neck: nothing to bend
         hand = leaf not in target.feet
         base, base_s = (chain[0], chain_s[0]) if hand else (0, 0)
-        length = lambda s, c: np.linalg.norm(s.offsets[c[hand:]], axis=1).sum()  # noqa: B023, E731
+        # For a foot all bones from the root, in case the limb begins further out: the root's ratio is of those.
+        length = lambda s, c: np.linalg.norm(s.offsets[c[1:]], axis=1).sum() if hand else s.reach(c[-1:])[0]  # noqa: B023, E731
         ratio = length(target, chain) / length(m.skeleton, chain_s)
         p, g = pose(out)
         goal = p[:, base] + ratio * (p_source[:, chain_s[-1]] - p_source[:, base_s])
@@ -715,6 +717,7 @@ def sliding(m: Motion, standing) -> float:
 def error(m: Motion, true: Motion, root=True) -> float:
     r"""The paper's measure: mean over frames, joints and axes of ((p - p_true) / height)^2.
 
+    Where on the floor the root of the first frame is does not count: a motion may begin anywhere.
     Args      root : False compares joints relative to the root
     Test      tests/test_skeletal_data.py::test_error
     """

@@ -102,6 +102,8 @@ class Domain:
     def statistics_of(self, c: Skeleton):
         """(mean, std) of any character of this structure, from its proportions."""
         d2 = np.mean((self.lengths - np.log(self._bones(c))) ** 2, axis=1)
+        if d2.min() < 1e-6:  # bones equal to a tenth of a per cent: that character, whose own it has
+            return self.mean[d2.argmin()], self.std[d2.argmin()]
         w = np.exp(-0.5 * (d2 - d2.min()) / 0.1**2)
         w /= w.sum()
         return (w @ self.mean).astype(np.float32), (w @ self.std).astype(np.float32)
@@ -181,7 +183,7 @@ def own_folders(opt) -> tuple:
         if first is not None:
             order = data.aligned(motions[0].skeleton, first)
             s = reorder_structure(s, order)
-            motions = [data.to_motion(data.read_rig(f, opt.up, patterns), s) for f in _files(path, opt)]
+            motions = [reorder_motion(m, s, order) for m in motions]
         first = first or motions[0].skeleton
         motions = [m for m in motions if len(m) >= WINDOW]
         if not motions:
@@ -197,18 +199,18 @@ def own_folders(opt) -> tuple:
     return tuple(domains)
 
 
-def _files(path, opt):
-    root = Path(path)
-    files = sorted(f for f in root.rglob("*") if f.suffix.lower() == ".bvh") if root.is_dir() else [root]
-    return [f for f in files if data.fnmatchcase(f.stem, opt.clips)][: opt.limit]
-
-
 def reorder_structure(s: Structure, order) -> Structure:
     """The same structure with its joints in another order."""
     at = {int(j): i for i, j in enumerate(order)}
     parents = (-1, *(at[s.parents[j]] for j in order[1:]))
     return replace(s, names=tuple(s.names[j] for j in order), parents=parents, reference=s.reference[order],
                    feet=tuple(sorted(at[f] for f in s.feet)), end=tuple(s.end[j] for j in order))  # fmt: skip
+
+
+def reorder_motion(m: data.Motion, s: Structure, order) -> data.Motion:
+    """The same motion with its joints in the order of `reorder_structure`'s s."""
+    skeleton = Skeleton(s.names, s.parents, m.skeleton.offsets[order], s.feet)
+    return replace(m, skeleton=skeleton, quat=m.quat[:, order])
 
 
 # ------------------------------------------------------------------------------------ training
@@ -254,7 +256,8 @@ def choices_of(variant, root=None) -> Choices:
 class Trainer:
     r"""Generators and critics of two structures, and one optimiser step  [SAN §5].
 
-    Test      tests/test_skeletal_train.py::test_step_learns, test_resume_is_exact, test_whole_loss_gradient
+    Test      tests/test_skeletal_train.py::test_step_learns, test_resume_is_exact, test_whole_loss_gradient,
+              test_direction_by_the_equations, test_critics_tell_fakes
     """
 
     def __init__(self, opt: TrainOptions, domains, dtype=np.float32, channels=None):
@@ -427,8 +430,17 @@ def prepared(opt) -> tuple:
             who, x, turn = zip(*d.arrays)
             arrays |= {f"who{k}": np.array(who), f"long{k}": np.array([len(v) for v in x]), f"x{k}": np.concatenate(x),
                        f"turn{k}": np.concatenate(turn)}  # fmt: skip
-        save_checkpoint(opt.data, arrays, {"domains": domain_meta(domains)})
+        save_checkpoint(opt.data, arrays, {"domains": domain_meta(domains), "motions": origins(opt)})
     return domains
+
+
+def origins(opt) -> list:
+    """The folders that a run's motions come from, whose licences its weights have; of --data, those it was made of.
+
+    Test: tests/test_skeletal_play.py::test_licence_is_the_motions"""
+    if opt.data and Path(opt.data).exists() and (kept := load_checkpoint(opt.data)[1].get("motions")):
+        return kept
+    return [opt.a, opt.b] if opt.a else [opt.motion]
 
 
 def domains_from(arrays, meta, path) -> tuple:
@@ -471,7 +483,7 @@ def train(argv) -> int:
         kept, given = stored_options(TrainOptions, out), opt.lr if "--lr" in " ".join(argv) else None
         opt = replace(TrainOptions(**kept), out=str(out), resume=True, steps=opt.steps, save_minutes=opt.save_minutes)
         opt = replace(opt, lr=given) if given is not None else opt
-    domains = prepared(opt)
+    domains, origin = prepared(opt), origins(opt)
     for name, d in zip("AB", domains):
         print(f"{name}: {len(d.names)} joints, {len(d.characters)} characters, {len(d.windows)} windows")
     if not all(len(d.windows) for d in domains):
@@ -487,7 +499,7 @@ def train(argv) -> int:
     def save():
         meta = {"steps": trainer.step_count, "rows": metrics.rows, "rng": rng_state(trainer.rng)}
         meta |= {"variant": opt.variant, "root": "carried" if trainer.choices.carry_root else "decoded"}
-        meta |= {"pool": opt.pool, "motion": opt.motion, "domains": domain_meta(domains)}
+        meta |= {"pool": opt.pool, "motions": origin, "domains": domain_meta(domains)}
         save_checkpoint(out / CHECKPOINT, trainer.arrays(), meta)
 
     last, sums, count = time.monotonic(), {}, 0
@@ -523,13 +535,16 @@ def ship(run, path) -> dict:
         raise UserError(f"{run} has no checkpoint; valid: a folder that skeletal.py train wrote")
     arrays, meta = found
     keep = {k: v for k, v in arrays.items() if not k.startswith(("adam", "critic", "pool"))}
-    motion = meta["motion"]
-    notes = sorted(Path(motion).glob("LICENSE*")) if Path(motion).is_dir() else []
-    title = (
-        notes[0].read_text(errors="replace").strip().split("\n")[0] if notes else "no licence file beside the motion"
-    )
-    licence = "MIT" if motion == "builtin" else f"weights trained on {Path(motion).name}, licensed: {title}"
-    meta = {k: v for k, v in meta.items() if k not in ("rng", "rows")}
-    meta |= {"motion": Path(motion).name, "licence": licence, "versions": versions(), "git": git_state()}
+    motions = meta.get("motions") or [meta["motion"]]  # one word in older runs
+    own = [m for m in motions if m != "builtin"]
+    parts = []
+    for motion in map(Path, own):
+        notes = sorted(motion.glob("LICENSE*")) if motion.is_dir() else []
+        title = notes[0].read_text(errors="replace").strip().split("\n")[0] if notes else "no licence file beside it"
+        parts.append(f"{motion.name}, licensed: {title}")
+    licence = "weights trained on " + "; on ".join(parts) if own else "MIT"
+    meta = {k: v for k, v in meta.items() if k not in ("rng", "rows", "motions")}
+    meta |= {"motion": ", ".join(Path(m).name for m in motions), "licence": licence}
+    meta |= {"versions": versions(), "git": git_state()}
     save_checkpoint(path, keep, meta)
     return meta

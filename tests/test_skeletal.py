@@ -367,6 +367,26 @@ def test_encoder_decoder_gradients(settings):
         check_along(x, v, lambda: np.sum(dy * run()[0]), np.sum(dx * v))
 
 
+def test_static_branch_is_a_masked_product():
+    """[SAN §4.2] With T = 1 and k = 1 the convolution is a matrix that is zero between armatures that are not near."""
+    g, _, s, _ = net_case()
+    graph, x = sk.Graph(SMALL), s
+    features, _ = g.static_forward(s)
+    for k, (wide, whole) in enumerate(((3, False), (sk.STATIC[0], True))):
+        (W, _, b), near = g.params[g.s[k]], graph.neighbours(2)
+        out, dense = sk.STATIC[k], np.zeros((len(graph) * sk.STATIC[k], len(graph) * wide))
+        for i, neighbours in enumerate(near):
+            for place, j in enumerate(neighbours):
+                dense[out * i : out * i + out, wide * j : wide * j + wide] = W[i][
+                    0, :, wide * place : wide * place + wide
+                ]
+        y = (dense @ x + b[:, None]).reshape(len(graph), out, -1)
+        graph, groups = graph.pool(whole)
+        x = np.concatenate([y[m].mean(axis=0) for m in groups])
+        x = np.where(x > 0, x, 0.2 * x)
+        np.testing.assert_allclose(features[k + 1], x, atol=1e-12)
+
+
 def test_latent_is_the_primal_skeletons():
     g = net.Generator(HUMAN, rngs())
     f, _ = g.static_forward(np.zeros((63, 1), np.float32))

@@ -195,6 +195,23 @@ def test_truth_keeps_ends_and_contacts():
         assert data.error(copy, t) > 1e-5  # and is no copy
 
 
+def test_truth_where_legs_begin_further_out():
+    """Legs that hang from a pelvis below the root: feet still stand where they stood, in the root's ratio."""
+    names, parents = ("root", "pelvis", "head", *NAMES[3:]), (-1, 0, 0, 1, 3, 4, 5, 1, 7, 8, 9)
+    offsets = OFFSETS + 0.0
+    offsets[1:3] = [0, 0, -0.15], [0, 0, 0.5]
+    s = data.Skeleton(names, parents, offsets, (6, 10))
+    c = data.replace(s, offsets=offsets * np.where(np.arange(11) == 1, 1.3, 0.8)[:, None])
+    m = walk(40, s)
+    t = data.truth(m, c)
+    p, q = data.pose(m)[0], data.pose(t)[0]
+    assert s.reach()[1] == pytest.approx(0.15 + 0.1 + sum(np.linalg.norm(v) for v in offsets[4:7]))
+    assert s.height == pytest.approx(0.15 + 0.88 + 0.5) and s.leg == pytest.approx(s.reach([6])[0])
+    for f in s.feet:
+        wanted = (p[:, f] - p[:, 0]) * c.leg / s.leg
+        assert np.median(np.linalg.norm(q[:, f] - q[:, 0] - wanted, axis=1)) < 0.01
+
+
 def test_foot_cleanup():
     """Standing feet stop sliding, flying feet and the rest of the body stay."""
     m = data.human_motion(mocap.load("builtin", clips="walk_005")[0])[:90]

@@ -84,6 +84,23 @@ def test_ship_and_load(trained, tmp_path):
         play.Retargeter(tmp_path)
 
 
+def test_licence_is_the_motions(trained, tmp_path, clips):
+    """Weights have the licence of the folders they come from, also of --a and --b, and by way of --data."""
+    arrays, meta = load_checkpoint(trained / "run" / CHECKPOINT)
+    for k, title in (("a", "CC0"), ("b", "Non-commercial")):
+        (tmp_path / k).mkdir()
+        (tmp_path / k / "LICENSE.txt").write_text(title + "\nmore\n")
+    opt = st.TrainOptions(a=str(tmp_path / "a"), b=str(tmp_path / "b"))
+    assert st.origins(st.TrainOptions()) == ["builtin"] and st.origins(opt) == [opt.a, opt.b]
+    save_checkpoint(tmp_path / "windows.npz", {}, {"motions": st.origins(opt)})
+    found = st.origins(st.TrainOptions(data=str(tmp_path / "windows.npz")))
+    (tmp_path / "run").mkdir()
+    save_checkpoint(tmp_path / "run" / CHECKPOINT, arrays, meta | {"motions": found})
+    meta = st.ship(tmp_path / "run", tmp_path / "s.npz")
+    assert meta["licence"] == "weights trained on a, licensed: CC0; on b, licensed: Non-commercial"
+    assert meta["motion"] == "a, b" and str(tmp_path) not in str(load_checkpoint(tmp_path / "s.npz")[1])
+
+
 def test_retargeter_any_length(trained):
     """Whole clips of any length, even shorter than a window; the heading and the path in legs are the source's."""
     net = play.Retargeter(trained / "run")
@@ -153,6 +170,17 @@ def test_own_folders(tmp_path):
     assert [domains[0].names[e] for e in domains[0].ends] == [domains[1].names[e] for e in domains[1].ends]
     tr = st.Trainer(opt, domains, channels=(2, 3))
     assert np.isfinite(list(tr.step().values())).all()
+    # The second rig's joints, put into the first one's order, move as they did.
+    m = data.folder(tmp_path / "1")[1][1]
+    x, turn = data.features(m)
+    names = ("root", *m.skeleton.names[1:])
+    got = domains[1].arrays[2][1]  # the second file's, forwards
+    for j, n in enumerate(domains[1].names):
+        k = names.index(n) if j else 0
+        np.testing.assert_allclose(got[:, 3 + 4 * j : 7 + 4 * j], x[:, 3 + 4 * k : 7 + 4 * k], atol=1e-6)
+    write_rig(tmp_path / "1" / "2.bvh", walk(90, mixed, 2), frames)
+    chosen = st.own_folders(st.replace(opt, limit=2))[1].arrays  # evenly chosen: the first and the last of three
+    assert sorted({len(x) for _, x, _ in chosen}) == [70, 90]
     (tmp_path / "2").mkdir()
     short = data.Skeleton(NAMES[:7], (-1, 0, 1, 0, 3, 4, 5), BODY.offsets[:7], (6,))
     write_rig(tmp_path / "2" / "a.bvh", walk(70, short))
