@@ -508,7 +508,7 @@ class _Loader:
             hinges = [j for j in body.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE]
             axes = "".join("xyz"[np.argmax(np.abs(j.axis))] for j in hinges)
             if len(set(axes)) != len(axes):
-                self.fail_xml(f"body {body.name} has two hinges about one axis ({axes})")
+                self.fail_xml(f"body {body.name} has two hinges about one axis ({axes}); valid: x, y and z once each")
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")

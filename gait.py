@@ -711,7 +711,7 @@ STANDING = (
     ("sidestep", {"sidestep": (0.2, 0.45), "strokes": (0.5, 2.0)}),
     ("stand", {"sway": (1.0, 2.0)}),
     ("start", {"speed": (0.5, 0.9), "sway": (1.0, 2.0)}),
-    ("stand", {"sway": (1.0, 4.0), "crouch": (0.05, 0.25), "strokes": (0.3, 1.5)}),
+    ("stand", {"sway": (1.0, 3.0), "crouch": (0.03, 0.15), "strokes": (0.3, 1.5)}),
     ("gesture", {"sway": (0.5, 2.0)}),
     ("sidestep", {"sidestep": (-0.45, -0.2), "sway": (1.0, 2.0)}),
     ("stand", {"sway": (0.5, 3.0), "strokes": (1.0, 3.0)}),

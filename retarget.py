@@ -105,8 +105,8 @@ def sole_points(char: Character, xpos, xmat):
     """Where the feet can touch the floor: ends of capsules and centres of spheres, lowered by the radius; box corners.
 
     Args      xpos (T, ngeom, 3); xmat (T, ngeom, 9), world
-    Returns   (T, 2, p, 3) [m], world
-    Test      tests/test_retarget.py::test_sole_points
+    Returns   (T, 2, p, 3) [m], world; a foot of fewer points than the other one repeats its first
+    Test      tests/test_retarget.py::test_sole_points, test_feet_of_two_shapes
     """
     m, feet = char.model, []
     for foot in char.sole_geoms:
@@ -120,8 +120,9 @@ def sole_points(char: Character, xpos, xmat):
             else:
                 ends = (-half, half) if m.geom_type[g] == mujoco.mjtGeom.mjGEOM_CAPSULE else (0.0,)
                 points += [xpos[:, g] + r[:, :, 2] * h - [0.0, 0.0, radius] for h in ends]
-        feet.append(np.stack(points, axis=1))
-    return np.stack(feet, axis=1)
+        feet.append(points)
+    most = max(map(len, feet))
+    return np.stack([np.stack(f + f[:1] * (most - len(f)), axis=1) for f in feet], axis=1)
 
 
 # ------------------------------------------------------------------------------------ human pose -> character pose

@@ -57,6 +57,8 @@ class Network:
     def conv(self, plan: ConvPlan, gain=GAIN, keys=None):
         """Reserve a convolution's parameters; -> its number.  He's initial weights, biases zero.
 
+        ASSUMED   V, the static features' weights, at 0.5 / sqrt(inputs): smaller, so that motion leads at first
+
         keys : a tuple of integers an armature, in and out; the weights from one armature to another are then drawn by
         their keys, so that two structures start with the same weights wherever their armatures correspond
         """

@@ -307,6 +307,19 @@ def test_sole_points(which, rng, request):
     np.testing.assert_allclose(found[..., 2].min(axis=(1, 2)), lowest, atol=1e-12)
 
 
+def test_feet_of_two_shapes(char, rng):
+    """One foot loses a shape: its first point stands in for the missing ones, the other foot's stay as they are."""
+    n, (left, right) = char.model.ngeom, char.sole_geoms
+    pose = rng.normal(size=(3, n, 3)), np.tile(np.eye(3).ravel(), (3, n, 1))
+    whole = retarget.sole_points(char, *pose)
+    less = retarget.sole_points(dataclasses.replace(char, sole_geoms=(left[:1], right)), *pose)
+    assert less.shape == whole.shape
+    k = whole.shape[2] // len(left)
+    np.testing.assert_array_equal(less[:, 1], whole[:, 1])
+    np.testing.assert_array_equal(less[:, 0, :k], whole[:, 0, :k])
+    np.testing.assert_array_equal(less[:, 0, k:], np.repeat(whole[:, 0, :1], whole.shape[2] - k, axis=1))
+
+
 def test_forward_kinematics(char, rng):
     """Against one MjData after the other; chunks leave no trace."""
     qpos, qvel = random_states(char, rng, 11)
