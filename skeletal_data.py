@@ -639,7 +639,7 @@ def truth(m: Motion, target: Skeleton) -> Motion:
         ratio = length(target, chain) / length(m.skeleton, chain_s)
         p, g = pose(out)
         goal = p[:, base] + ratio * (p_source[:, chain_s[-1]] - p_source[:, base_s])
-        if leaf in target.feet:
+        if leaf in target.feet and len(chain) > 3:
             ankle = target.parents[leaf]
             keep = g[:, ankle].copy()
             goal = goal - quat_rotate(keep, np.broadcast_to(target.offsets[leaf], goal.shape))
@@ -677,7 +677,8 @@ def contacts(m: Motion) -> np.ndarray:
 
 def clean_feet(m: Motion, standing) -> Motion:
     r"""Foot clean-up  [SAN §5.2]: while a foot stands, it stays at the mean of its places; blended in and out over +- 5
-    frames with a smooth step; by damped least squares on the leg; the foot keeps its orientation.
+    frames with a smooth step; by damped least squares on the leg; the foot keeps its orientation.  A leg that ends at
+    the ankle is solved for its end.
 
     Args      standing : (T, F) contacts of the input motion
     Test      tests/test_skeletal_data.py::test_foot_cleanup
@@ -687,7 +688,7 @@ def clean_feet(m: Motion, standing) -> Motion:
         chain = _limb(m.skeleton, f)
         if len(chain) < 3:
             continue
-        ankle = m.skeleton.parents[f]
+        ankle, leg = (m.skeleton.parents[f], chain[:-2]) if len(chain) > 3 else (f, chain[:-1])
         p, g = pose(out)
         shift, weight = np.zeros((len(m), 3)), np.zeros(len(m))
         edges = np.flatnonzero(np.diff(np.concatenate([[0], standing[:, i].astype(int), [0]])))
@@ -699,7 +700,7 @@ def clean_feet(m: Motion, standing) -> Motion:
                 if w > weight[t]:
                     weight[t], shift[t] = w, w * (goal - p[min(max(t, a), b - 1), f])
         keep = g[:, ankle].copy()
-        out = solve_ik(out, [(ankle, p[:, ankle] + shift, chain[:-2], _stiffness(m.skeleton, chain[:-2]))])
+        out = solve_ik(out, [(ankle, p[:, ankle] + shift, leg, _stiffness(m.skeleton, leg))])
         out = _hold(out, ankle, keep)
     return out
 

@@ -229,6 +229,26 @@ def test_foot_cleanup():
     assert data.sliding(m, nobody) == 0.0
 
 
+def test_foot_cleanup_without_toes():
+    """A leg of thigh, shin and ankle alone: both of its joints help, and the ankle stays where it stood."""
+    m = data.human_motion(mocap.load("builtin", clips="walk_005")[0])[:90]
+    s, kept = m.skeleton, [i for i, n in enumerate(m.skeleton.names) if not n.startswith("ball")]
+    parents = tuple(kept.index(p) if p >= 0 else -1 for p in np.array(s.parents)[kept])
+    names = tuple(s.names[i] for i in kept)
+    feet = tuple(names.index(n) for n in ("foot_l", "foot_r"))
+    bare = data.Skeleton(names, parents, s.offsets[kept], feet)
+    stand = data.contacts(m)
+    pos = m.pos + np.linspace(0, 0.25, 90)[:, None] * [1.0, 0.5, 0.0]
+    drift = data.replace(m, skeleton=bare, quat=m.quat[:, kept], pos=pos)
+    clean = data.clean_feet(drift, stand)
+    assert data.sliding(drift, stand) > 0.06 and data.sliding(clean, stand) < 0.3 * data.sliding(drift, stand)
+    turned = [
+        np.abs(clean.quat[:, names.index(n)] - drift.quat[:, names.index(n)]).max() for n in ("thigh_l", "shin_l")
+    ]
+    assert min(turned) > 1e-3
+    np.testing.assert_allclose(data.pose(clean)[1][:, feet], data.pose(drift)[1][:, feet], atol=1e-9)  # orientation
+
+
 def test_error():
     """By a slow loop; where the clip starts does not count; relative to the root travel does not either."""
     m = walk(10)
