@@ -36,6 +36,7 @@ from runs import (
     UNIT,
     Metrics,
     Progress,
+    StopFlag,
     UserError,
     arg,
     check_run,
@@ -314,21 +315,24 @@ def train(opt):
         save_checkpoint(path, trainer.arrays(), kept)
 
     sums, count = {}, 0
-    while trainer.updates < opt.updates:
-        for name, value in trainer.iterate().items():
-            sums[name] = sums.get(name, 0.0) + value
-        count += 1
-        if count == COUNT_SHOWN or trainer.updates >= opt.updates:
-            lr, kl, own = trainer.schedule()
-            row = {k: v / count for k, v in sums.items()}
-            metrics.append({"updates": trainer.updates, **row, "lr": lr, "kl_weight": kl, "own": own})
-            progress.update(trainer.updates, {k: f"{v:.1f}" for k, v in row.items()} | {"own": f"{own:.2f}"})
-            sums, count = {}, 0
-        if time.monotonic() - saved > 60 * opt.checkpoint_minutes and count == 0:
-            save()
-            saved = time.monotonic()
-    save()
+    with StopFlag() as flag:
+        while trainer.updates < opt.updates and not flag.stop:
+            for name, value in trainer.iterate().items():
+                sums[name] = sums.get(name, 0.0) + value
+            count += 1
+            if count == COUNT_SHOWN or trainer.updates >= opt.updates:
+                lr, kl, own = trainer.schedule()
+                row = {k: v / count for k, v in sums.items()}
+                metrics.append({"updates": trainer.updates, **row, "lr": lr, "kl_weight": kl, "own": own})
+                progress.update(trainer.updates, {k: f"{v:.1f}" for k, v in row.items()} | {"own": f"{own:.2f}"})
+                sums, count = {}, 0
+            if time.monotonic() - saved > 60 * opt.checkpoint_minutes and count == 0:
+                save()
+                saved = time.monotonic()
+        save()
     metrics.close()
+    if flag.stop:
+        print(f"stopped at {trainer.updates} updates; continue with: python drop_prior.py train --resume --out {out}")
     return trainer
 
 

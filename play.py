@@ -688,7 +688,7 @@ def main(argv=None):
     if opt.stream and opt.measure:
         raise UserError("--measure compares with a human's motion, which a stream has not; give one of the two")
     push = parse_push(opt.push)
-    check_folders(opt.json, opt.png, opt.video, opt.bvh)
+    check_folders(opt.json, opt.png, opt.video, opt.bvh, read=(*mocap.parts(opt.motion), opt.stream, opt.policy))
     if opt.json and not (opt.measure or opt.compare):
         raise UserError("--json writes the table of --measure or --compare: give one of them")
     if not opt.compare:

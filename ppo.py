@@ -15,7 +15,6 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-import signal
 import time
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
@@ -59,6 +58,7 @@ from runs import (
     UNIT,
     Metrics,
     Progress,
+    StopFlag,
     UserError,
     arg,
     check_run,
@@ -784,27 +784,6 @@ def resumed_options(opt: Options, argv) -> Options:
             value = getattr(opt, f.name)
         values[f.name] = value
     return Options(**values | {"resume": True, "out": opt.out})
-
-
-class StopFlag:
-    """Ctrl-C or SIGTERM ends the run after the present update, with a checkpoint; a second one at once.
-
-    Test      tests/test_ppo.py::test_interrupt_ends_with_a_checkpoint
-    """
-
-    def __enter__(self):
-        self.stop = False
-        self.old = {s: signal.signal(s, self._on) for s in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def _on(self, number, frame):
-        if self.stop:
-            raise KeyboardInterrupt
-        self.stop = True
-
-    def __exit__(self, *_):
-        for s, handler in self.old.items():
-            signal.signal(s, handler)
 
 
 def train(opt: Options) -> Trainer:

@@ -466,7 +466,7 @@ def main(argv=None):
     opt = cli(Options, argv, "retarget.py", __doc__)
     if opt.check:
         return report(opt.check)
-    check_folders(opt.bvh, opt.png, opt.video)
+    check_folders(opt.bvh, opt.png, opt.video, read=mocap.parts(opt.motion))
     char = opt.load()
     clips = mocap.load(opt.motion, clips=opt.clips, reading=Reading.of(opt))
     print(

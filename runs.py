@@ -23,6 +23,7 @@ import json
 import math
 import os
 import platform
+import signal
 import stat
 import struct
 import subprocess
@@ -238,14 +239,45 @@ def atomic_write(path, content, previous=None):
         raise UserError(f"cannot write {path}: {reason}; give a folder that exists and is writable") from None
 
 
-def check_folders(*paths) -> None:
-    """Before the slow work: the folders of the files to write, None left out.  UserError: one is not there
+def check_folders(*paths, read=()) -> None:
+    """Before the slow work: the files to write, None left out, have a folder and destroy nothing.
 
-    Test      tests/test_cli.py::test_folder_to_write
+    Args      read : files and folders that are read, None left out
+    Raises    UserError: no such folder; the file is one of those read, or motion in a folder of them; it is read-only
+    Test      tests/test_cli.py::test_folder_to_write, test_nothing_read_is_overwritten
     """
     for out in filter(None, paths):
-        if not Path(out).resolve().parent.is_dir():
+        file = Path(out).resolve()
+        if not file.parent.is_dir():
             raise UserError(f"cannot write {out}: there is no folder {Path(out).parent}")
+        for source in (Path(s).resolve() for s in read if s):
+            inside = source in file.parents and source.is_dir() and file.suffix.lower() in (".bvh", ".amc", ".asf")
+            if file == source or (inside and file.exists()):
+                raise UserError(f"cannot write {out}: it is read from; give another file")
+        if file.is_file() and not file.stat().st_mode & 0o222:
+            raise UserError(f"cannot write {out}: it is read-only; give another file")
+
+
+class StopFlag:
+    """Ctrl-C or SIGTERM ends a run after the present update, with a checkpoint; a second one at once.
+
+    Test      tests/test_ppo.py::test_interrupt_ends_with_a_checkpoint, tests/test_skeletal_play.py::test_interrupt,
+              tests/test_drop_vae.py::test_interrupt
+    """
+
+    def __enter__(self):
+        self.stop = False
+        self.old = {s: signal.signal(s, self._on) for s in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def _on(self, number, frame):
+        if self.stop:
+            raise KeyboardInterrupt
+        self.stop = True
+
+    def __exit__(self, *_):
+        for s, handler in self.old.items():
+            signal.signal(s, handler)
 
 
 # ---- files from outside ---------------------------------------------------------------------------------------------

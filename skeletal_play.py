@@ -29,6 +29,7 @@ from runs import (
     UserError,
     arg,
     atomic_write,
+    check_folders,
     check_run,
     cli,
     latest_checkpoint,
@@ -132,6 +133,7 @@ def retarget(argv) -> int:
     opt = cli(RetargetOptions, argv, "skeletal.py retarget", RetargetOptions.__doc__)
     if not opt.source or not opt.target or not (opt.out or opt.png or opt.video):
         raise UserError("give --source FILE.bvh, --target FILE.bvh (or B/0), and --out FILE.bvh, --png or --video")
+    check_folders(opt.out, opt.png, opt.video, read=(opt.source, opt.target, opt.weights))
     net = Retargeter(opt.weights)
     patterns = tuple(p for p in opt.drop.split(",") if p)
     up = lambda k: net.domains[k].structure.up  # noqa: E731
@@ -233,14 +235,20 @@ class MeasureOptions:
     json: str | None = arg(None, "write the figures here")
 
 
+LEGEND = """cross, intra: ((p - p_true) / height)^2 x 1000 across the two structures and within them; _clean: after the
+foot clean-up; _pose: joints relative to the root; _ab, _ba: from the first structure to the second, and back; copy_: the
+best of the three copies; slide: mean speed of standing feet [cm/s], retargeted, after the clean-up, and the truth's"""
+
+
 def measure(argv) -> int:
     """python skeletal.py measure: errors x 1000.  Test: tests/test_skeletal_play.py::test_measure_command"""
     opt = cli(MeasureOptions, argv, "skeletal.py measure", MeasureOptions.__doc__)
+    check_folders(opt.json, Path(opt.png) / "sheet.png" if opt.png else None)
     nets = {name: Retargeter(name) for name in opt.weights.split(",")}
     cases = held_out(opt, next(iter(nets.values())))
     results = {"copies": copies(cases), "shifted": shifted(cases, next(iter(nets.values())))}
     for how, row in results["copies"].items():
-        print(f"copy ({how:6s})  " + "  ".join(f"{k} {v:.3f}" for k, v in row.items()))
+        print(f"copy ({how})".ljust(15) + "  ".join(f"{k} {v:.3f}" for k, v in row.items()))
     print("copy in the target's statistics  " + "  ".join(f"{k} {v:.3f}" for k, v in results["shifted"].items()))
     best = {k: min(row[k] for row in results["copies"].values()) for k in ("cross", "intra")}
     for name, net in nets.items():
@@ -248,6 +256,7 @@ def measure(argv) -> int:
         row |= {"copy_cross": best["cross"], "copy_intra": best["intra"]}
         results[Path(name).stem if Path(name).suffix else Path(name).name] = row
         print(f"{name}\n  " + "  ".join(f"{k} {v:.3f}" for k, v in row.items()))
+    print(LEGEND)
     first = next(v for k, v in results.items() if k not in ("copies", "shifted"))
     if opt.png:
         sheets(cases, next(iter(nets.values())), opt)

@@ -24,6 +24,7 @@ from runs import (
     POSITIVE,
     Metrics,
     Progress,
+    StopFlag,
     UserError,
     arg,
     check_run,
@@ -480,9 +481,9 @@ def train(argv) -> int:
     if (opt.a is None) != (opt.b is None):
         raise UserError("--a and --b go together: two folders of two rigs; or give --motion alone")
     if opt.resume:
-        kept, given = stored_options(TrainOptions, out), opt.lr if "--lr" in " ".join(argv) else None
-        opt = replace(TrainOptions(**kept), out=str(out), resume=True, steps=opt.steps, save_minutes=opt.save_minutes)
-        opt = replace(opt, lr=given) if given is not None else opt
+        said = {a.split("=")[0].lstrip("-").replace("-", "_") for a in argv if a.startswith("--")}
+        given = {k: getattr(opt, k) for k in ("lr", "steps", "save_minutes") if k in said}
+        opt = replace(TrainOptions(**stored_options(TrainOptions, out)), out=str(out), resume=True, **given)
     domains, origin = prepared(opt), origins(opt)
     for name, d in zip("AB", domains):
         print(f"{name}: {len(d.names)} joints, {len(d.characters)} characters, {len(d.windows)} windows")
@@ -504,23 +505,26 @@ def train(argv) -> int:
 
     last, sums, count = time.monotonic(), {}, 0
     try:
-        while trainer.step_count < opt.steps:
-            for adam in trainer.adams:
-                adam.lr = opt.lr * (1.0 - 0.9 * trainer.step_count / opt.steps)
-            for k, v in trainer.step().items():
-                sums[k] = sums.get(k, 0.0) + v
-            count += 1
-            if trainer.step_count % 50 == 0 or trainer.step_count == opt.steps:
-                row = {k: v / count for k, v in sums.items()}
-                metrics.append({"step": trainer.step_count} | row)
-                progress.update(trainer.step_count, {k: f"{v:.4g}" for k, v in row.items()})
-                sums, count = {}, 0
-                if time.monotonic() - last > 60 * opt.save_minutes:
-                    save()
-                    last = time.monotonic()
-        save()
+        with StopFlag() as flag:
+            while trainer.step_count < opt.steps and not flag.stop:
+                for adam in trainer.adams:
+                    adam.lr = opt.lr * (1.0 - 0.9 * trainer.step_count / opt.steps)
+                for k, v in trainer.step().items():
+                    sums[k] = sums.get(k, 0.0) + v
+                count += 1
+                if trainer.step_count % 50 == 0 or trainer.step_count == opt.steps:
+                    row = {k: v / count for k, v in sums.items()}
+                    metrics.append({"step": trainer.step_count} | row)
+                    progress.update(trainer.step_count, {k: f"{v:.4g}" for k, v in row.items()})
+                    sums, count = {}, 0
+                    if time.monotonic() - last > 60 * opt.save_minutes:
+                        save()
+                        last = time.monotonic()
+            save()
     finally:
         metrics.close()
+    if flag.stop:
+        print(f"stopped at {trainer.step_count} steps; continue with: python skeletal.py train --resume --out {out}")
     return 0
 
 

@@ -208,6 +208,31 @@ def test_folder_to_write(here, capsys):
             assert f"cannot write {here / 'no' / 'x.bvh'}: there is no folder {here / 'no'}" in err
 
 
+def test_nothing_read_is_overwritten(here, capsys):
+    """A motion, one in a folder of motions, a link to it, a policy, a stream, and what is read-only: all stay."""
+    folder = here / "motion"
+    folder.mkdir()
+    own, other = folder / "walk_001.bvh", here / "kept.png"
+    own.write_text("a motion")
+    other.write_text("a picture")
+    other.chmod(0o444)
+    (here / "link.bvh").symlink_to(own)
+    policy = small_policy(here / "p.npz")
+    for script, *flags in (
+        ("retarget", "--motion", own, "--bvh", own),
+        ("retarget", "--motion", f"builtin,{folder}", "--bvh", own),
+        ("retarget", "--motion", own, "--bvh", here / "link.bvh"),
+        ("play", "--motion", folder, "--bvh", own, "--policy", policy),
+        ("play", "--png", policy, "--policy", policy),
+        ("play", "--stream", own, "--png", own),
+    ):
+        assert f"cannot write {flags[3] if flags[2] != '--policy' else flags[1]}: it is read from" in refuse(
+            capsys, here, script, *flags
+        )
+    assert "it is read-only; give another file" in refuse(capsys, here, "retarget", "--motion", own, "--png", other)
+    assert own.read_text() == "a motion" and other.read_text() == "a picture"
+
+
 @pytest.mark.parametrize("script", RUNS)
 def test_no_clip_matches(script, here, capsys):
     more = ["--measure", "--policy", small_policy(here / "p.npz")] if script == "play" else []

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -310,6 +311,29 @@ def test_training_resumes(tmp_path, monkeypatch):
     save_checkpoint(tmp_path / "b" / CHECKPOINT, {"x": np.zeros(2)}, {"updates": 1})
     with pytest.raises(UserError, match="not a checkpoint of this run"):
         training.train(training.replace(opt, resume=True))
+
+
+def test_interrupt(tmp_path, monkeypatch, capsys):
+    """Ctrl-C after the second update: a checkpoint of it, and how to go on; then the same weights as at one go."""
+    monkeypatch.setattr(training, "recorded", lambda *a, **k: [motion()])
+    whole = training.train(training.Options(out=str(tmp_path / "a"), **TINY))
+    opt = training.Options(out=str(tmp_path / "b"), **TINY)
+    iterate, calls = training.Trainer.iterate, []
+
+    def press(self):
+        calls.append(1)
+        if len(calls) == 2:
+            signal.raise_signal(signal.SIGINT)
+        return iterate(self)
+
+    monkeypatch.setattr(training.Trainer, "iterate", press)
+    stopped = training.train(opt)
+    assert len(calls) == 2 and stopped.updates < whole.updates
+    assert load_checkpoint(tmp_path / "b" / CHECKPOINT)[1]["updates"] == stopped.updates
+    assert f"drop_prior.py train --resume --out {tmp_path / 'b'}" in capsys.readouterr().out
+    again = training.train(training.replace(opt, resume=True))
+    for name, net in whole.nets.items():
+        np.testing.assert_array_equal(net.theta, again.nets[name].theta)
 
 
 def test_training_from_shipped_networks(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """skeletal.py's four commands as a user meets them, and what they write."""
 
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -66,6 +67,44 @@ def test_train_command(trained, capsys, tmp_path):
     assert run("train", "--out", out) == 2 and "add --resume" in capsys.readouterr().err
     assert run("train", "--a", tmp_path, "--out", tmp_path / "x") == 2 and "--a and --b" in capsys.readouterr().err
     assert run("train", "--steps", 0) == 2 and not (tmp_path / "x").exists()
+
+
+def test_interrupt(trained, capsys, tmp_path, monkeypatch):
+    """Ctrl-C in the second step: a checkpoint after it, how to go on, and --resume goes on to the same --steps."""
+    out, step, calls = tmp_path / "run", st.Trainer.step, []
+
+    def press(self):
+        calls.append(1)
+        if len(calls) == 2:
+            signal.raise_signal(signal.SIGINT)
+        return step(self)
+
+    monkeypatch.setattr(st.Trainer, "step", press)
+    options = ["--data", trained / "windows.npz", "--out", out, "--batch", 2]
+    assert run("train", *options, "--steps", 3) == 0
+    assert load_checkpoint(out / CHECKPOINT)[1]["steps"] == 2
+    assert (
+        f"stopped at 2 steps; continue with: python skeletal.py train --resume --out {out}" in capsys.readouterr().out
+    )
+    assert run("train", "--resume", "--out", out) == 0
+    assert load_checkpoint(out / CHECKPOINT)[1]["steps"] == 3 and len(calls) == 3
+
+
+def test_nothing_read_is_overwritten(trained, tmp_path, capsys):
+    """The source, the target and the weights stay; a read-only file, too; folders for sheets are asked for first."""
+    a, b = tmp_path / "a.bvh", tmp_path / "b.bvh"
+    data.write_motion(a, data.human_motion(CLIPS[0]), play.Retargeter(trained / "run").domains[0].structure)
+    b.write_bytes(a.read_bytes())
+    kept = tmp_path / "kept.bvh"
+    kept.write_text("mine")
+    kept.chmod(0o444)
+    before = a.read_bytes()
+    for out, why in ((a, "read from"), (b, "read from"), (tmp_path / "." / "a.bvh", "read from"), (kept, "read-only")):
+        assert run("retarget", "--weights", trained / "run", "--source", a, "--target", b, "--out", out) == 2
+        assert f"cannot write {out}: it is {why}" in capsys.readouterr().err
+    assert a.read_bytes() == before == b.read_bytes() and kept.read_text() == "mine"
+    assert run("measure", "--weights", trained / "run", "--png", tmp_path / "none") == 2
+    assert "there is no folder" in (said := capsys.readouterr()).err and "copy" not in said.out
 
 
 def test_ship_and_load(trained, tmp_path):
