@@ -236,7 +236,7 @@ class MeasureOptions:
 
 
 LEGEND = """cross, intra: ((p - p_true) / height)^2 x 1000 across the two structures and within them; _clean: after the
-foot clean-up; _pose: joints relative to the root; _ab, _ba: from the first structure to the second, and back; copy_: the
+foot clean-up; _pose: joints relative to the root; _ab, _ba: from the first structure to the second, back; copy_: the
 best of the three copies; slide: mean speed of standing feet [cm/s], retargeted, after the clean-up, and the truth's"""
 
 

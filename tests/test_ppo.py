@@ -570,7 +570,7 @@ def test_resume_refuses_other_options(whole, tmp_path, monkeypatch):
     with pytest.raises(UserError, match="already holds a run"):
         train(whole, 6)
     original = mocap.builtin_clips
-    monkeypatch.setattr(mocap, "builtin_clips", lambda *_, **__: original(rate, seed=1))
+    monkeypatch.setattr(mocap, "builtin_clips", lambda rate, name: original(rate, seed=1))
     with pytest.raises(UserError, match="motions have changed.*--init"):
         train(whole, 8, "--resume")
     assert before == {p: p.read_bytes() for p in whole.iterdir()}  # refused: untouched
