@@ -4,6 +4,7 @@ r"""Proximal policy optimisation, every gradient by hand  [Reda23 §3.1, §3.7, 
     python ppo.py --character jesse --motion FOLDER --out runs/a       learn on motion capture
     python ppo.py --resume --out runs/a --steps 20e6                   continue exactly where it stopped
     python ppo.py --ship characters/jesse.npz --out runs/a             write the policy of a run, without the rest
+    python ppo.py --ship NEW.npz --out runs/a --blend OLD.npz          averaged with the one that it began from
     python ppo.py --gym HalfCheetah-v4                                 learn another's task, with CleanRL's settings
 
 One update:  collect `horizon` steps of `envs` characters with the present policy  ->  values, advantages (gae)  ->
@@ -101,6 +102,8 @@ class Options(character.Switches):
     out: str | None = arg(None, "run folder; runs/CHARACTER by default")
     resume: bool = arg(False, "continue the run in --out exactly")
     ship: str | None = arg(None, "write the policy of the run in --out to this .npz, and train nothing")
+    blend: str | None = arg(None, "with --ship: average its weights with those of this policy, an ancestor of the run")
+    share: float = arg(0.5, "of the ancestor in that average", check=UNIT)
     init: str | None = arg(None, "start from the weights of a policy (.npz) or a run folder")
     gpu: bool = arg(False, "train on an NVIDIA GPU (extra gpu); give thousands of --envs")
     threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
@@ -416,14 +419,45 @@ def _checked_shape(shape, arrays) -> dict:
     return shape
 
 
-def ship(run, path) -> dict:
+def blended(policy: Policy, other: Policy, share: float) -> Policy:
+    r"""A policy's weights averaged with those of one that it was fine-tuned from.
+
+    Equation  theta = (1 - s) theta + s theta', and so the normaliser's means and variances  [Wortsman22, model soups]
+    Why       what was learnt lately on some motions and what was known before on others are both kept: two policies one
+              of which began as the other lie in one valley, and its middle is as low (measured, REPRODUCE.md)
+    Args      share : s, of the other one
+    Returns   policy, changed
+    Raises    ValueError: networks of other sizes
+    Test      tests/test_ppo.py::test_blended
+    """
+    if policy.shape() != other.shape():
+        raise ValueError(f"networks {other.shape()}, expected {policy.shape()}")
+    mix = lambda a, b: ((1.0 - share) * a.astype(float) + share * b).astype(a.dtype)  # noqa: E731
+    policy.theta_pi[:] = mix(policy.theta_pi, other.theta_pi)
+    policy.critic.theta[:] = mix(policy.critic.theta, other.critic.theta)
+    a, b = policy.norm.state(), other.norm.state()
+    policy.norm.load_state({
+        "count": a["count"], "mean": mix(a["mean"], b["mean"]),
+        "m2": mix(a["m2"], b["m2"] * (a["count"] / b["count"])),
+    })  # fmt: skip
+    return policy
+
+
+def ship(run, path, ancestor=None, share=0.5) -> dict:
     """Write a run's policy for others to play: weights, normaliser, how it was trained, its data's licence.
 
+    Args      ancestor : a policy to average it with (`blended`)
     Returns   what was written beside the weights
-    Raises    UserError: the run has no checkpoint, or the path cannot be written
-    Test      tests/test_ppo.py::test_ship
+    Raises    UserError: the run has no checkpoint, the ancestor is none, or the path cannot be written
+    Test      tests/test_ppo.py::test_ship, test_blended
     """
     policy, meta = load_policy(run)
+    if ancestor:
+        other, older = load_policy(ancestor)
+        try:
+            policy = blended(policy, other, share)
+        except ValueError as e:
+            raise UserError(f"--blend {ancestor}: {e}; valid: a policy that {run} was fine-tuned from") from None
     try:
         motion, _, _, _ = str(meta["options"]["motion"]), meta["options"]["init"], meta["steps"], meta["data"]
     except (KeyError, TypeError) as e:
@@ -439,6 +473,9 @@ def ship(run, path) -> dict:
     kept = {k: meta[k] for k in ("policy", "steps", "data")}
     init = meta["options"]["init"] and Path(meta["options"]["init"]).name
     kept["options"] = meta["options"] | {"motion": ",".join(names), "out": None, "init": init}
+    if ancestor:
+        kept["blend"] = {"with": Path(ancestor).name, "share": share}
+        licences += [t for t in [older.get("licence", "MIT")] if t != "MIT" and t not in licences]
     kept |= {"licence": "; ".join(licences) or "MIT", "versions": versions(), "git": git_state()}
     save_checkpoint(path, policy.arrays(), kept)
     return kept
@@ -881,7 +918,7 @@ def main(argv=None):
     opt = cli(with_defaults_of_cleanrl(Options) if of_gym else Options, argv, "ppo.py", __doc__)
     opt = replace(opt, out=opt.out or f"runs/{Path(opt.gym or opt.character).stem}")
     if opt.ship:
-        meta = ship(opt.out, opt.ship)
+        meta = ship(opt.out, opt.ship, opt.blend, opt.share)
         print(f"{opt.ship}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}; {meta['licence']}")
         return
     if opt.resume:

@@ -836,6 +836,27 @@ def test_config_tells_what_was_run(whole):
     assert (whole / CONFIG).exists() and {"python", "mujoco"} <= set(config["versions"])
 
 
+def test_blended(tmp_path):
+    """Shares of 0 and 1 are the two policies; between them weights, and the normaliser's variances, are means."""
+    paths = tmp_path / "old", tmp_path / "new"
+    for seed, path in enumerate(paths):
+        train(path, 2, "--seed", str(seed))
+    obs = np.random.default_rng(0).standard_normal((5, ppo.load_policy(paths[0])[0].obs_size)).astype(np.float32)
+    old, new = (ppo.load_policy(p)[0] for p in paths)
+    for share, like in ((0.0, new), (1.0, old)):
+        assert ppo.ship(paths[1], tmp_path / "b.npz", paths[0], share)["blend"] == {"with": "old", "share": share}
+        got = ppo.load_policy(tmp_path / "b.npz")[0]
+        np.testing.assert_allclose(got.mean_action(obs), like.mean_action(obs), atol=1e-5)
+    ppo.main(["--ship", str(tmp_path / "b.npz"), "--out", str(paths[1]), "--blend", str(paths[0]), "--share", "0.25"])
+    got = ppo.load_policy(tmp_path / "b.npz")[0]
+    np.testing.assert_allclose(got.theta_pi, 0.75 * new.theta_pi + 0.25 * old.theta_pi, atol=1e-6)
+    np.testing.assert_allclose(got.norm.var, 0.75 * new.norm.var + 0.25 * old.norm.var, rtol=1e-5)
+    np.testing.assert_allclose(got.norm.mean, 0.75 * new.norm.mean + 0.25 * old.norm.mean, atol=1e-5)
+    with pytest.raises(UserError, match="--blend .*: networks .*; valid: a policy that .* was fine-tuned from"):
+        ppo.ship(paths[1], tmp_path / "c.npz", Path(ppo.__file__).parent / "characters" / "jesse-hmd.npz")
+    assert not (tmp_path / "c.npz").exists()
+
+
 def test_ship(tmp_path, monkeypatch):
     """A shipped policy acts as the run's does, is small, and carries its data's licence."""
     folder = tmp_path / "motion"
