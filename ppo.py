@@ -4,7 +4,7 @@ r"""Proximal policy optimisation, every gradient by hand  [Reda23 §3.1, §3.7, 
     python ppo.py --character jesse --motion FOLDER --out runs/a       learn on motion capture
     python ppo.py --resume --out runs/a --steps 20e6                   continue exactly where it stopped
     python ppo.py --ship characters/jesse.npz --out runs/a             write the policy of a run, without the rest
-    python ppo.py --ship NEW.npz --out runs/a --blend OLD.npz          averaged with the one that it began from
+    python ppo.py --ship NEW.npz --out runs/a --blend OLD.npz          averaged with that one
     python ppo.py --gym HalfCheetah-v4                                 learn another's task, with CleanRL's settings
 
 One update:  collect `horizon` steps of `envs` characters with the present policy  ->  values, advantages (gae)  ->
@@ -102,8 +102,8 @@ class Options(character.Switches):
     out: str | None = arg(None, "run folder; runs/CHARACTER by default")
     resume: bool = arg(False, "continue the run in --out exactly")
     ship: str | None = arg(None, "write the policy of the run in --out to this .npz, and train nothing")
-    blend: str | None = arg(None, "with --ship: average its weights with those of this policy, an ancestor of the run")
-    share: float = arg(0.5, "of the ancestor in that average", check=UNIT)
+    blend: tuple[str, ...] = arg((), "with --ship: average its weights with those of these policies, of one ancestor")
+    share: float = arg(0.5, "of them all together in that average", check=UNIT)
     init: str | None = arg(None, "start from the weights of a policy (.npz) or a run folder")
     gpu: bool = arg(False, "train on an NVIDIA GPU (extra gpu); give thousands of --envs")
     threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
@@ -419,45 +419,51 @@ def _checked_shape(shape, arrays) -> dict:
     return shape
 
 
-def blended(policy: Policy, other: Policy, share: float) -> Policy:
-    r"""A policy's weights averaged with those of one that it was fine-tuned from.
+def blended(policy: Policy, others: list[Policy], share: float) -> Policy:
+    r"""A policy's weights averaged with those of its ancestor, or of others that were fine-tuned from the same one.
 
-    Equation  theta = (1 - s) theta + s theta', and so the normaliser's means and variances  [Wortsman22, model soups]
-    Why       what was learnt lately on some motions and what was known before on others are both kept: two policies one
-              of which began as the other lie in one valley, and its middle is as low (measured, REPRODUCE.md)
-    Args      share : s, of the other one
+    Equation  theta = (1 - s) theta + s mean(theta'), and so the normaliser's means and variances  [Wortsman22, "model
+              soups"]; the critic stays as it is if one of the others was trained with another reward
+    Why       what was learnt lately on some motions and what was known before on others are both kept: such policies
+              lie in one valley, and its middle is lower than its slopes (measured, REPRODUCE.md)
+    Args      share : s, of the others together
     Returns   policy, changed
     Raises    ValueError: networks of other sizes
     Test      tests/test_ppo.py::test_blended
     """
-    if policy.shape() != other.shape():
-        raise ValueError(f"networks {other.shape()}, expected {policy.shape()}")
-    mix = lambda a, b: ((1.0 - share) * a.astype(float) + share * b).astype(a.dtype)  # noqa: E731
-    policy.theta_pi[:] = mix(policy.theta_pi, other.theta_pi)
-    policy.critic.theta[:] = mix(policy.critic.theta, other.critic.theta)
-    a, b = policy.norm.state(), other.norm.state()
-    policy.norm.load_state({
-        "count": a["count"], "mean": mix(a["mean"], b["mean"]),
-        "m2": mix(a["m2"], b["m2"] * (a["count"] / b["count"])),
-    })  # fmt: skip
+    own = policy.shape()
+    for other in others:
+        if other.shape() | {"value_scale": own["value_scale"]} != own:
+            raise ValueError(f"networks {other.shape()}, expected {own}")
+
+    def mix(get):
+        rest = np.mean([get(p).astype(float) for p in others], axis=0)
+        return (1.0 - share) * get(policy) + share * rest
+
+    policy.theta_pi[:] = mix(lambda p: p.theta_pi)
+    if all(p.value_scale == policy.value_scale for p in others):
+        policy.critic.theta[:] = mix(lambda p: p.critic.theta)
+    mean, var, count = mix(lambda p: p.norm.mean64), mix(lambda p: p.norm.var), policy.norm.count
+    policy.norm.load_state({"count": np.array(count), "mean": mean, "m2": var * count})
     return policy
 
 
-def ship(run, path, ancestor=None, share=0.5) -> dict:
+def ship(run, path, blend=(), share=0.5) -> dict:
     """Write a run's policy for others to play: weights, normaliser, how it was trained, its data's licence.
 
-    Args      ancestor : a policy to average it with (`blended`)
+    Args      blend : policies to average it with (`blended`), share : of them together
     Returns   what was written beside the weights
-    Raises    UserError: the run has no checkpoint, the ancestor is none, or the path cannot be written
+    Raises    UserError: the run has no checkpoint, a policy does not fit, or the path cannot be written
     Test      tests/test_ppo.py::test_ship, test_blended
     """
     policy, meta = load_policy(run)
-    if ancestor:
-        other, older = load_policy(ancestor)
-        try:
-            policy = blended(policy, other, share)
-        except ValueError as e:
-            raise UserError(f"--blend {ancestor}: {e}; valid: a policy that {run} was fine-tuned from") from None
+    loaded = [load_policy(p) for p in blend]
+    try:
+        policy = blended(policy, [p for p, _ in loaded], share) if blend else policy
+    except ValueError as e:
+        raise UserError(
+            f"--blend {','.join(map(str, blend))}: {e}; valid: policies of one ancestor with {run}"
+        ) from None
     try:
         motion, _, _, _ = str(meta["options"]["motion"]), meta["options"]["init"], meta["steps"], meta["data"]
     except (KeyError, TypeError) as e:
@@ -470,12 +476,15 @@ def ship(run, path, ancestor=None, share=0.5) -> dict:
             text = notes[0].read_text(errors="replace") if notes else "no licence file beside the motion"
             title = text.strip().split("\n")[0]
             licences.append(f"weights trained on {names[-1]}, licensed: {title}")
+    if "licence" in meta:  # was shipped before
+        licences = [t for t in [str(meta["licence"])] if t != "MIT"]
     kept = {k: meta[k] for k in ("policy", "steps", "data")}
     init = meta["options"]["init"] and Path(meta["options"]["init"]).name
     kept["options"] = meta["options"] | {"motion": ",".join(names), "out": None, "init": init}
-    if ancestor:
-        kept["blend"] = {"with": Path(ancestor).name, "share": share}
-        licences += [t for t in [older.get("licence", "MIT")] if t != "MIT" and t not in licences]
+    if blend:
+        kept["blend"] = {"with": [Path(p).name for p in blend], "share": share}
+        older = {str(m["licence"]) for _, m in loaded if m.get("licence", "MIT") != "MIT"}
+        licences += sorted(older - set(licences))
     kept |= {"licence": "; ".join(licences) or "MIT", "versions": versions(), "git": git_state()}
     save_checkpoint(path, policy.arrays(), kept)
     return kept

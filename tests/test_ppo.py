@@ -844,7 +844,7 @@ def test_blended(tmp_path):
     obs = np.random.default_rng(0).standard_normal((5, ppo.load_policy(paths[0])[0].obs_size)).astype(np.float32)
     old, new = (ppo.load_policy(p)[0] for p in paths)
     for share, like in ((0.0, new), (1.0, old)):
-        assert ppo.ship(paths[1], tmp_path / "b.npz", paths[0], share)["blend"] == {"with": "old", "share": share}
+        assert ppo.ship(paths[1], tmp_path / "b.npz", paths[:1], share)["blend"] == {"with": ["old"], "share": share}
         got = ppo.load_policy(tmp_path / "b.npz")[0]
         np.testing.assert_allclose(got.mean_action(obs), like.mean_action(obs), atol=1e-5)
     ppo.main(["--ship", str(tmp_path / "b.npz"), "--out", str(paths[1]), "--blend", str(paths[0]), "--share", "0.25"])
@@ -852,8 +852,15 @@ def test_blended(tmp_path):
     np.testing.assert_allclose(got.theta_pi, 0.75 * new.theta_pi + 0.25 * old.theta_pi, atol=1e-6)
     np.testing.assert_allclose(got.norm.var, 0.75 * new.norm.var + 0.25 * old.norm.var, rtol=1e-5)
     np.testing.assert_allclose(got.norm.mean, 0.75 * new.norm.mean + 0.25 * old.norm.mean, atol=1e-5)
-    with pytest.raises(UserError, match="--blend .*: networks .*; valid: a policy that .* was fine-tuned from"):
-        ppo.ship(paths[1], tmp_path / "c.npz", Path(ppo.__file__).parent / "characters" / "jesse-hmd.npz")
+    ppo.ship(paths[1], tmp_path / "b.npz", [paths[0], paths[0], paths[1]], 0.75)
+    np.testing.assert_allclose(
+        ppo.load_policy(tmp_path / "b.npz")[0].theta_pi, 0.5 * (new.theta_pi + old.theta_pi), atol=1e-6
+    )
+    other = Path(ppo.__file__).parent / "characters" / "jesse-hmd.npz"
+    assert ppo.load_policy(other)[1]["licence"] != "MIT"
+    assert ppo.ship(other, tmp_path / "again.npz")["licence"] == ppo.load_policy(other)[1]["licence"]
+    with pytest.raises(UserError, match="--blend .*: networks .*; valid: policies of one ancestor with "):
+        ppo.ship(paths[1], tmp_path / "c.npz", [other])
     assert not (tmp_path / "c.npz").exists()
 
 
