@@ -104,6 +104,9 @@ class Options(character.Switches):
     ship: str | None = arg(None, "write the policy of the run in --out to this .npz, and train nothing")
     blend: tuple[str, ...] = arg((), "with --ship: average its weights with those of these policies, of one ancestor")
     share: float = arg(0.5, "of them all together in that average", check=UNIT)
+    gain: float = arg(
+        1.0, "with --ship: makes the policy's standardised observations so many times as large", check=POSITIVE
+    )
     init: str | None = arg(None, "start from the weights of a policy (.npz) or a run folder")
     gpu: bool = arg(False, "train on an NVIDIA GPU (extra gpu); give thousands of --envs")
     threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
@@ -448,10 +451,12 @@ def blended(policy: Policy, others: list[Policy], share: float) -> Policy:
     return policy
 
 
-def ship(run, path, blend=(), share=0.5) -> dict:
+def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     """Write a run's policy for others to play: weights, normaliser, how it was trained, its data's licence.
 
     Args      blend : policies to average it with (`blended`), share : of them together
+              gain : the normaliser's deviations are divided by it.  Averaging shrinks weights where policies differ,
+              and with them the answer to a deviation; a gain of some per cent gives it back (measured, REPRODUCE.md)
     Returns   what was written beside the weights
     Raises    UserError: the run has no checkpoint, a policy does not fit, or the path cannot be written
     Test      tests/test_ppo.py::test_ship, test_blended
@@ -481,6 +486,8 @@ def ship(run, path, blend=(), share=0.5) -> dict:
     kept = {k: meta[k] for k in ("policy", "steps", "data")}
     init = meta["options"]["init"] and Path(meta["options"]["init"]).name
     kept["options"] = meta["options"] | {"motion": ",".join(names), "out": None, "init": init}
+    policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})
+    kept |= {"gain": gain} if gain != 1.0 else {}
     if blend:
         kept["blend"] = {"with": [Path(p).name for p in blend], "share": share}
         older = {str(m["licence"]) for _, m in loaded if m.get("licence", "MIT") != "MIT"}
@@ -927,7 +934,7 @@ def main(argv=None):
     opt = cli(with_defaults_of_cleanrl(Options) if of_gym else Options, argv, "ppo.py", __doc__)
     opt = replace(opt, out=opt.out or f"runs/{Path(opt.gym or opt.character).stem}")
     if opt.ship:
-        meta = ship(opt.out, opt.ship, opt.blend, opt.share)
+        meta = ship(opt.out, opt.ship, opt.blend, opt.share, opt.gain)
         print(f"{opt.ship}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}; {meta['licence']}")
         return
     if opt.resume:

@@ -856,6 +856,11 @@ def test_blended(tmp_path):
     np.testing.assert_allclose(
         ppo.load_policy(tmp_path / "b.npz")[0].theta_pi, 0.5 * (new.theta_pi + old.theta_pi), atol=1e-6
     )
+    ppo.ship(paths[1], tmp_path / "b.npz", gain=1.25)
+    x = np.random.default_rng(1).standard_normal((3, new.critic_size))
+    louder = ppo.load_policy(tmp_path / "b.npz")[0]
+    inside = np.abs(new.norm(x)) < 8  # the rest is clipped
+    np.testing.assert_allclose(louder.norm(x)[inside], 1.25 * new.norm(x)[inside], rtol=0.01)
     other = Path(ppo.__file__).parent / "characters" / "jesse-hmd.npz"
     assert ppo.load_policy(other)[1]["licence"] != "MIT"
     assert ppo.ship(other, tmp_path / "again.npz")["licence"] == ppo.load_policy(other)[1]["licence"]
