@@ -87,8 +87,9 @@ def run_main(main_fn, argv=None):
 
 # ---- command line ---------------------------------------------------------------------------------------------------
 
-POSITIVE = (lambda v: np.isfinite(v) and v > 0, "greater than 0")
-NONNEGATIVE = (lambda v: np.isfinite(v) and v >= 0, "0 or greater")
+HUGE = 1e18  # NumPy has no integers above 2**63; also refuses infinity, and NaN fails every comparison
+POSITIVE = (lambda v: 0 < v < HUGE, "greater than 0 and below 1e18")
+NONNEGATIVE = (lambda v: 0 <= v < HUGE, "0 or greater, and below 1e18")
 UNIT = (lambda v: 0 <= v <= 1, "from 0 to 1")
 COUNT = (lambda v: 1 <= v <= 10**6, "from 1 to 1000000")
 THREADS = (lambda v: 0 <= v <= 1024, "from 0 to 1024")

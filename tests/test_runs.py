@@ -53,6 +53,7 @@ def test_cli_reads_every_kind():
         (["--step", "3"], ["--step", "--steps"]),
         (["--steps", "-3"], ["--steps", "greater than 0"]),
         (["--steps", "1.5"], ["--steps", "1.5"]),
+        (["--steps", "1e30"], ["--steps", "below 1e18"]),
         (["--learning-rate", "nan"], ["--learning-rate", "greater than 0"]),
         (["--learning_rate", "fast"], ["--learning-rate", "fast"]),
         (["--hidden", ""], ["--hidden", "256,128"]),
