@@ -449,11 +449,17 @@ def builtin_clips(rate=CONTROL_RATE, seed=0, name="builtin") -> list[Clip]:
     return out
 
 
+SETS = "builtin, standing, a .bvh or .amc file, a folder of them, several with commas between them"
+
+
 def parts(motion) -> list[str]:
     """The data sets of a --motion: one, or several with commas between them (unless a file has that name).
 
     Test      tests/test_mocap.py::test_joined"""
-    return str(motion).split(",") if not Path(motion).exists() else [str(motion)]
+    sets = str(motion).split(",") if not Path(motion).exists() else [str(motion)]
+    if "" in sets:
+        raise UserError(f"--motion {motion}: an empty name, a comma too many; valid: {SETS}")
+    return sets
 
 
 def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS_IT_IS) -> list[Clip]:
@@ -477,9 +483,8 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
         items = [(c.name, c.name, c) for c in builtin_clips(rate, name=motion)]
     else:
         path = Path(motion)
-        if not str(motion) or not path.exists():
-            valid = "builtin, standing, a .bvh or .amc file, a folder of them, several with commas between them"
-            raise UserError(f"{motion}: no such file or folder; valid: {valid}")
+        if not path.exists():
+            raise UserError(f"{motion}: no such file or folder; valid: {SETS}")
         found = (f for f in path.rglob("*") if f.suffix.lower() in (".bvh", ".amc") and not f.is_dir())
         files = sorted(found) if path.is_dir() else [path]
         if not files:
@@ -498,7 +503,10 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
         more = f", … ({len(names)})" if len(names) > 6 else ""
         raise UserError(f"{motion}: no clip matches {clips!r}; there are {', '.join(names[:6])}{more}")
     if not chosen and motion not in BUILTIN and len(files) < 10 and split not in ("style", "body") and not bodies:
-        print(f"{motion}: only {len(files)} clips, none to hold out: {split} uses all of them", file=sys.stderr)
+        print(
+            f"{motion}: only {len(files)} clip{'s' * (len(files) > 1)}, none to hold out: {split} uses all of them",
+            file=sys.stderr,
+        )
         chosen = [item for _, _, item in matching]
     if not chosen:
         found = sorted({part for _, part, _ in matching})

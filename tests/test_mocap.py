@@ -740,9 +740,14 @@ def test_joined(tmp_path, capsys):
     assert [c.name for c in out][-1] == "walk,turn_001" and len(out) == 19
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("standing [train] 18 clips") and lines[1].startswith(str(tmp_path))
-    for wrong in ("builtin,", "builtin,nowhere", ","):
-        with pytest.raises(UserError, match="no such file or folder; valid: builtin, standing, "):
-            mocap.load(wrong)
+    with pytest.raises(UserError, match="nowhere: no such file or folder; valid: builtin, standing, "):
+        mocap.load("builtin,nowhere")
+    for wrong in ("builtin,", ",builtin", "builtin,,standing", ","):
+        for read in (mocap.load, mocap.sequences):
+            capsys.readouterr()
+            with pytest.raises(UserError, match=f"--motion {wrong}: an empty name, .* valid: builtin, standing, "):
+                read(wrong)
+            assert capsys.readouterr().out == ""  # said before anything is read
 
 
 def test_builtin(library):
