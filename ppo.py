@@ -886,6 +886,10 @@ def _loop(trainer: Trainer, loaded, meta, seconds):
         f"{data['sequences']} sequences, {data['minutes']:.1f} min; policy {trainer.policy.actor.n_params:,} and "
         f"critic {trainer.policy.critic.n_params:,} weights; ready in {seconds:.1f} s"
     )
+    if trainer.steps >= opt.steps:
+        print(
+            f"nothing to do: {fmt_count(trainer.steps)} steps are done, and --steps {opt.steps} is the total to reach"
+        )
     saved = time.perf_counter()
     with StopFlag() as flag:
         while trainer.steps < opt.steps and not flag.stop:
