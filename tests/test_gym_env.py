@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -426,7 +427,7 @@ def test_resume_is_exact(task, tmp_path, capsys):
         def stopping(self):
             out = update(self)
             if next(count) == 3:
-                ppo.signal.raise_signal(ppo.signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
             return out
 
         patch.setattr(ppo.Trainer, "update", stopping)
