@@ -187,13 +187,13 @@ def physics_table(char, ref, act, envs=256, seconds=1.0, seed=0, threads=0) -> l
     options = char.model.opt
     kept = options.solver, options.iterations, options.timestep
     steps, runs = round(seconds * ref.rate), []
-    for substeps, solver, iterations in SETTINGS:
+    for substeps, solver, iterations in SETTINGS:  # a batch keeps the options that it was made with
+        options.solver, options.iterations = getattr(mujoco.mjtSolver, f"mjSOL_{solver}"), iterations
         env = Env(char, ref, envs, seed, threads, substeps=substeps, autoreset=False)
         env.reset(frames=np.random.default_rng(seed).choice(env.starts[env.starts + steps <= env.starts[-1]], envs))
-        runs.append((env, getattr(mujoco.mjtSolver, f"mjSOL_{solver}"), iterations, [], [], np.ones(envs, bool)))
+        runs.append((env, [], [], np.ones(envs, bool)))
     for _ in range(steps):
-        for env, solver, iterations, times, depth, alive in runs:
-            options.solver, options.iterations, options.timestep = solver, iterations, env.dt / env.substeps
+        for env, times, depth, alive in runs:
             start = time.perf_counter()
             terminated = env.step(act(env))[2]
             times.append(time.perf_counter() - start)
@@ -202,7 +202,7 @@ def physics_table(char, ref, act, envs=256, seconds=1.0, seed=0, threads=0) -> l
             depth.append(-1000 * low[low < 0])
     options.solver, options.iterations, options.timestep = kept
     rows, (best, *_, alive_best) = [], runs[0]
-    for (substeps, solver, iterations), (env, _, _, times, depth, alive) in zip(SETTINGS, runs, strict=True):
+    for (substeps, solver, iterations), (env, times, depth, alive) in zip(SETTINGS, runs, strict=True):
         both = alive & alive_best
         apart = 1000 * np.linalg.norm(env.qpos[both, :3] - best.qpos[both, :3], axis=1)
         rows.append({"substeps": substeps, "solver": solver, "iterations": iterations,
