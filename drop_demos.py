@@ -178,11 +178,7 @@ class Stage:
         self.general, self.limits = None, drop.project_range_of_motion if opt.limits else None
         if "vae" in (opt.prior, opt.range):
             motion, pose, meta = load_networks(opt.weights)
-            self.limits = (
-                PoseRange(pose, meta["bound"], meta.get("angle", np.inf))
-                if opt.limits and opt.range == "vae"
-                else self.limits
-            )
+            self.limits = PoseRange.of(pose, meta) if opt.limits and opt.range == "vae" else self.limits
         if opt.prior == "vae":
             self.general = VaePrior(motion)
         elif opt.prior == "nearest":

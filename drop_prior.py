@@ -309,6 +309,11 @@ class PoseRange:
     def __init__(self, net, bound, angle=np.inf):
         self.net, self.bound, self.angle = net, float(bound), float(angle)
 
+    @classmethod
+    def of(cls, net, meta):
+        """With the bound and the angle that were shipped with the networks (`load_networks`)."""
+        return cls(net, meta["bound"], meta.get("angle", np.inf))
+
     def norm(self, C):
         """‖E(q)‖ (B,) of rotations (B, 22, 3, 3), whose rows are the columns."""
         return np.linalg.norm(self.net.encode(vae.pose_columns(C)), axis=1)

@@ -519,7 +519,7 @@ def evaluate(opt):
         p = np.percentile(norms, [50, 99, 99.9])
         print(f"  ‖E(q)‖: median {p[0]:.2f}, 99 % {p[1]:.2f}, 99.9 % {p[2]:.2f}; bound {meta['bound']:.2f}")
     last = list(recordings.values())[-1]
-    limit = PoseRange(pose, meta["bound"], meta.get("angle", np.inf))
+    limit = PoseRange.of(pose, meta)
     found = detection(limit, recordings.get("validation", last), rng, min(500, len(last.x)))
     for what, by in found.items():
         shares = (f"{rule} {100 * b:5.1f} %" for rule, b in zip(("‖E‖", "pose VAE", "limits"), by, strict=True))
@@ -575,7 +575,7 @@ def rollout(opt, stride=5):
     limit = float(np.percentile(d, 99))
     print(f"held-out clips: nearest recorded frame {100 * np.median(d):.1f} cm, the limit (99 %) {100 * limit:.1f} cm")
     prior, rng = VaePrior(motion), np.random.default_rng(opt.seed)
-    limits = PoseRange(pose, meta["bound"], meta.get("angle", np.inf))
+    limits = PoseRange.of(pose, meta)
     x, q = held[0]
     for name, sim in (("prior alone", None), ("inside DROP", Simulator(prior, limits=limits))):
         began = time.process_time()
@@ -613,14 +613,12 @@ def ship(opt):
     """
     motion, pose, meta = load_networks(Path(opt.out) / CHECKPOINT)
     trained = stored_options(Options, opt.out)
-    source = Path(trained["motion"])
+    sets = mocap.parts(trained["motion"])
     held = Recording(recorded(trained["motion"], "validation", trained["clips"], stitched=False))
-    notes = sorted(source.glob("LICENSE*")) if source.is_dir() else []
-    title = (
-        notes[0].read_text(errors="replace").strip().split("\n")[0] if notes else "no licence file beside the motion"
-    )
-    options = {k: v for k, v in trained.items() if k not in ("weights", "out", "resume")} | {"motion": source.name}
-    licence = "MIT" if trained["motion"] == "builtin" else f"weights trained on {source.name}, licensed: {title}"
+    options = {k: v for k, v in trained.items() if k not in ("weights", "out", "resume")} | {
+        "motion": ",".join(Path(s).name for s in sets)
+    }
+    licence = "; ".join(f"weights trained on {text}" for text in mocap.licences(sets)) or "MIT"
     bound, angle = calibrate(pose, held)
     kept = {"options": options, "updates": meta["updates"], "bound": bound, "angle": angle, "licence": licence,
             "versions": versions(), "git": git_state()}  # fmt: skip

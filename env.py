@@ -457,9 +457,9 @@ class Env:
 
         Equation  uniform over all frames [§3.6]; with `balance` half of the simulated time is shared out by frames and
                   half by frames × rate of failure:  p(sequence) ∝ frames (1 + h / ⟨h⟩) / E[T],
-                  E[T] = (1 − e^{−hH}) / h, within the sequence uniform
+                  E[T] = (1 − e^{−hH}) / h, within the sequence uniform; with `retry` that share of episodes starts
+                  RETRY steps before a place where one failed of late
         Symbols   h failures a step, of late (`_count`); ⟨h⟩ its mean over frames; H horizon; T steps of an episode
-                  with `retry` that share of episodes starts RETRY steps before a place where one failed of late
         Why       after a while most failures are in a few sequences, and a uniform draw spends its steps on the others;
                   within them they are at a few places, such as the first steps of a run
         Returns   (len(ids),) frames

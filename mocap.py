@@ -462,6 +462,20 @@ def parts(motion) -> list[str]:
     return sets
 
 
+def licences(sets) -> list[str]:
+    """Of each data set that is not built in: its name, and the first line of the licence file beside it.
+
+    Test      tests/test_mocap.py::test_licences, tests/test_ppo.py::test_ship
+    """
+    out = []
+    for path in (Path(s) for s in sets if s not in BUILTIN):
+        notes = sorted(path.glob("LICENSE*")) if path.is_dir() else []
+        text = notes[0].read_text(errors="replace") if notes else "no licence file beside the motion"
+        title = text.strip().split("\n")[0]
+        out.append(f"{path.name}, licensed: {title}")
+    return out
+
+
 def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS_IT_IS) -> list[Clip]:
     """Single clips of a data set, at one rate.
 

@@ -66,6 +66,7 @@ from runs import (
     cli,
     fmt_count,
     git_state,
+    given_flags,
     latest_checkpoint,
     load_checkpoint,
     open_run,
@@ -473,19 +474,13 @@ def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
         motion, _, _, _ = str(meta["options"]["motion"]), meta["options"]["init"], meta["steps"], meta["data"]
     except (KeyError, TypeError) as e:
         raise UserError(f"{run}: does not say how it was trained ({e}); valid: a folder that ppo.py wrote") from None
-    names, licences = [], []
-    for part in mocap.parts(motion):
-        names.append(Path(part).name)
-        if part not in mocap.BUILTIN:
-            notes = sorted(Path(part).glob("LICENSE*")) if Path(part).is_dir() else []
-            text = notes[0].read_text(errors="replace") if notes else "no licence file beside the motion"
-            title = text.strip().split("\n")[0]
-            licences.append(f"weights trained on {names[-1]}, licensed: {title}")
+    sets = mocap.parts(motion)
+    licences = [f"weights trained on {text}" for text in mocap.licences(sets)]
     if "licence" in meta:  # was shipped before
         licences = [t for t in [str(meta["licence"])] if t != "MIT"]
     kept = {k: meta[k] for k in ("policy", "steps", "data")}
     init = meta["options"]["init"] and Path(meta["options"]["init"]).name
-    kept["options"] = meta["options"] | {"motion": ",".join(names), "out": None, "init": init}
+    kept["options"] = meta["options"] | {"motion": ",".join(Path(s).name for s in sets), "out": None, "init": init}
     policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})
     kept |= {"gain": gain} if gain != 1.0 else {}
     if blend:
@@ -824,7 +819,7 @@ def resumed_options(opt: Options, argv) -> Options:
     """
     check_run(opt.out, resume=True)
     stored = stored_options(Options, opt.out)
-    given = {a.split("=")[0].lstrip("-").replace("-", "_") for a in argv if a.startswith("--")}
+    given = given_flags(argv)
     values = {}
     for f in fields(Options):
         value = stored.get(f.name, getattr(opt, f.name))

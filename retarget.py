@@ -23,7 +23,6 @@ import character
 import mocap
 from character import Character, geom_lowest
 from mocap import (
-    MOTION,
     SEG,
     Clip,
     angular_velocity,
@@ -410,7 +409,7 @@ class Options(character.Switches):
     """What `python retarget.py` can be told."""
 
     check: str | None = arg(None, "name every part that a character lacks: path of its .xml or .toml")
-    motion: str = arg("builtin", MOTION)
+    motion: str = arg("builtin", mocap.MOTION)
     clips: str = arg("*", "shell pattern on clip names")
     joint_map: str | None = arg(None, HELP["joint_map"])
     unit: str | None = arg(None, HELP["unit"])

@@ -149,6 +149,13 @@ def cli(dataclass_type, argv, prog, description):
     return dataclass_type(**vars(values))
 
 
+def given_flags(argv) -> set:
+    """Names of the fields whose flags are on a command line, whatever their values.
+
+    Test      tests/test_ppo.py::test_resume_refuses_other_options, tests/test_skeletal_play.py::test_interrupt"""
+    return {a.split("=")[0].lstrip("-").replace("-", "_") for a in argv if a.startswith("--")}
+
+
 def _dashed(a):
     """--some_flag=a_b -> --some-flag=a_b; anything else unchanged."""
     name, equals, value = a.partition("=")

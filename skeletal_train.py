@@ -30,6 +30,7 @@ from runs import (
     check_run,
     cli,
     git_state,
+    given_flags,
     latest_checkpoint,
     load_checkpoint,
     open_run,
@@ -481,8 +482,7 @@ def train(argv) -> int:
     if (opt.a is None) != (opt.b is None):
         raise UserError("--a and --b go together: two folders of two rigs; or give --motion alone")
     if opt.resume:
-        said = {a.split("=")[0].lstrip("-").replace("-", "_") for a in argv if a.startswith("--")}
-        given = {k: getattr(opt, k) for k in ("lr", "steps", "save_minutes") if k in said}
+        given = {k: getattr(opt, k) for k in given_flags(argv) & {"lr", "steps", "save_minutes"}}
         opt = replace(TrainOptions(**stored_options(TrainOptions, out)), out=str(out), resume=True, **given)
     domains, origin = prepared(opt), origins(opt)
     for name, d in zip("AB", domains):
@@ -540,13 +540,8 @@ def ship(run, path) -> dict:
     arrays, meta = found
     keep = {k: v for k, v in arrays.items() if not k.startswith(("adam", "critic", "pool"))}
     motions = meta.get("motions") or [meta["motion"]]  # one word in older runs
-    own = [m for m in motions if m != "builtin"]
-    parts = []
-    for motion in map(Path, own):
-        notes = sorted(motion.glob("LICENSE*")) if motion.is_dir() else []
-        title = notes[0].read_text(errors="replace").strip().split("\n")[0] if notes else "no licence file beside it"
-        parts.append(f"{motion.name}, licensed: {title}")
-    licence = "weights trained on " + "; on ".join(parts) if own else "MIT"
+    own = mocap.licences(motions)
+    licence = "weights trained on " + "; on ".join(own) if own else "MIT"
     meta = {k: v for k, v in meta.items() if k not in ("rng", "rows", "motions")}
     meta |= {"motion": ", ".join(Path(m).name for m in motions), "licence": licence}
     meta |= {"versions": versions(), "git": git_state()}

@@ -758,6 +758,19 @@ def test_joined(tmp_path, capsys):
             assert capsys.readouterr().out == ""  # said before anything is read
 
 
+def test_licences(tmp_path):
+    """The first line of a folder's licence; one without says so; what is built in needs none."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b.bvh").write_text("")
+    (tmp_path / "a" / "LICENSE.txt").write_text("\nNon-commercial.\nMore.\n")
+    sets = mocap.parts(f"builtin,{tmp_path / 'a'},standing,{tmp_path / 'b.bvh'}")
+    assert mocap.licences(sets) == [
+        "a, licensed: Non-commercial.",
+        "b.bvh, licensed: no licence file beside the motion",
+    ]
+    assert mocap.licences(["builtin", "standing"]) == []
+
+
 def test_builtin(library):
     """Ten minutes, the same bytes for a seed, and feet that neither skate nor sink by our own contact labels."""
     a, b, c = library, mocap.builtin_clips(), mocap.builtin_clips(seed=1)
