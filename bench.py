@@ -28,7 +28,7 @@ import resource
 import time
 from dataclasses import dataclass, replace
 
-os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "10")  # as ppo.py does, and says why; before NumPy is loaded
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as ppo.py does, and says why; before NumPy is loaded
 
 import mujoco
 import numpy as np

@@ -149,6 +149,7 @@ def moved(trainer, device="cuda"):
     policy.actor.theta = policy.theta_pi[: policy.actor.n_params]  # views again
     policy.log_std = policy.theta_pi[policy.actor.n_params :]
     env.attach(worlds)
+    trainer.two = False  # the GPU has streams of its own
     return trainer
 
 

@@ -17,14 +17,15 @@ import hashlib
 import math
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from statistics import fmean
 
-# OpenBLAS's idle threads spin for 25 ms before they sleep and take the cores from the physics.
-# 2^10 cycles is enough; it must be said before NumPy is loaded.
-os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "10")
+# OpenBLAS's threads would take the cores from the physics, spinning while they wait, and from `aside`.
+# It must be said before NumPy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
@@ -261,6 +262,22 @@ def explained_variance(value, target):
     return float(1.0 - np.var(target - value) / var) if var > 0 else 0.0
 
 
+# ------------------------------------------------------------------------------------ two cores
+
+SECOND = ThreadPoolExecutor(1)  # `aside`; its thread begins with the first use
+
+
+def aside(work, two=True):
+    """Begin `work`, a function without arguments, on a second core, if there are `two`.  NumPy lets other threads run
+    while it computes on large arrays; work must share nothing with what its caller does meanwhile, and then the results
+    are those of one thread.
+
+    Returns   function that waits for what work returns, or raises what it raised
+    Test      tests/test_ppo.py::test_second_thread_changes_nothing
+    """
+    return SECOND.submit(work).result if two else work
+
+
 # ------------------------------------------------------------------------------------ policy
 
 
@@ -294,10 +311,13 @@ class Policy:
         x = np.clip((obs - n.mean[: self.obs_size]) * n.inv_std[: self.obs_size], -n.clip, n.clip)
         return self.actor(x)
 
-    def value(self, x, rows=8192):
-        """V of normalised critic observations (B, critic_size) -> (B,) float64."""
-        out = [self.critic(x[i : i + rows])[:, 0] for i in range(0, len(x), rows)]
-        return np.concatenate(out).astype(float) * self.value_scale
+    def value(self, x, rows=4096, two=False):
+        """V of normalised critic observations (B, critic_size) -> (B,) float64; two : on two cores."""
+        parts = [x[i : i + rows] for i in range(0, len(x), rows)]
+        half = len(parts) // 2
+        first = aside(lambda: [self.critic(p)[:, 0] for p in parts[:half]], two)
+        second = [self.critic(p)[:, 0] for p in parts[half:]]
+        return np.concatenate(first() + second).astype(float) * self.value_scale
 
     def arrays(self):
         """All that makes the policy, for a checkpoint.  Test: tests/test_ppo.py::test_policy_round_trip"""
@@ -530,6 +550,7 @@ class Trainer:
         self.logp = np.zeros((t, n), np.float32)
         self.reward, self.next_value = np.zeros((t, n)), np.zeros((t, n))
         self.terminated, self.truncated = np.zeros((t, n), bool), np.zeros((t, n), bool)
+        self.two = opt.threads != 1 and opt.minibatch >= 1024
 
     def start(self):
         """First observation; the normaliser begins with it, or the first update would see unscaled inputs."""
@@ -593,7 +614,7 @@ class Trainer:
         """
         env, policy = self.env, self.policy
         t, n = self.reward.shape
-        self.old_value = policy.value(self.x.reshape(t * n, -1)).reshape(t, n)
+        self.old_value = policy.value(self.x.reshape(t * n, -1), two=self.two).reshape(t, n)
         self.next_value[:-1] = self.old_value[1:]
         self.next_value[-1] = policy.value(policy.norm.normalise(env.full))  # App. B: bootstrap at the trajectory's end
         for step, ids, rows in finals:  # truncation is not failure
@@ -616,36 +637,49 @@ class Trainer:
         variance = explained_variance(self.old_value, target)
         flat = lambda v: v.reshape(-1, *v.shape[2:])  # noqa: E731
         x, action, mu, logp = flat(self.x), flat(self.action), flat(self.mu), flat(self.logp)
+        seen = x[:, : policy.obs_size]
         adv = (advantage if opt.standardise_minibatch else standardise(advantage)).ravel().astype(np.float32)
         old_value = (self.old_value / policy.value_scale).ravel().astype(np.float32)
         target = (target / policy.value_scale).ravel().astype(np.float32)
         old_std = policy.log_std.copy()
         samples = len(adv)
         kls, clipped, pi_losses, v_losses = [], [], [], []
-        for _ in range(opt.epochs):
+
+        def critic(rows):
+            old = (old_value[rows], opt.clip_eps) if opt.value_clip else ()
+            return critic_loss(policy, x[rows], target[rows], *old)
+
+        def critic_step(rows):
+            loss, grad = critic(rows)
+            clip_grad_norm(grad, opt.max_grad_norm)
+            self.adam_v.step(policy.critic.theta, grad)
+            return loss
+
+        for epoch in range(opt.epochs):
             order = self.rng.permutation(samples)
-            kls = []
-            for start in range(0, samples, opt.minibatch):
-                rows = order[start : start + opt.minibatch]
-                xb, advb = x[rows], standardise(adv[rows]) if opt.standardise_minibatch else adv[rows]
-                loss, grad, out = policy_loss(
-                    policy, xb[:, : policy.obs_size], action[rows], logp[rows], advb, opt.clip_eps
-                )
-                old = (old_value[rows], opt.clip_eps) if opt.value_clip else ()
-                v_loss, v_grad = critic_loss(policy, xb, target[rows], *old)
+            batches = [order[start : start + opt.minibatch] for start in range(0, samples, opt.minibatch)]
+            kls, apart = [], [] if opt.joint_clip else batches
+            learnt = aside(lambda apart=apart: [critic_step(rows) for rows in apart], self.two)
+            if epoch == 0 and not opt.norm_each_step:  # for the next samples; these are normalised already
+                policy.norm.update(self.raw)
+            for rows in batches:
+                advb = standardise(adv[rows]) if opt.standardise_minibatch else adv[rows]
+                loss, grad, out = policy_loss(policy, seen[rows], action[rows], logp[rows], advb, opt.clip_eps)
                 if opt.joint_clip:
+                    v_loss, v_grad = critic(rows)
                     both = np.concatenate([grad, opt.joint_clip * v_grad])
                     clip_grad_norm(both, opt.max_grad_norm)
                     grad, v_grad = np.split(both, [len(grad)])
+                    self.adam_v.step(policy.critic.theta, v_grad)
+                    v_losses.append(v_loss)
                 else:
                     clip_grad_norm(grad, opt.max_grad_norm)
-                    clip_grad_norm(v_grad, opt.max_grad_norm)
                 kls.append(gaussian_kl(mu[rows], old_std, out["mu"], policy.log_std))
                 self.adam_pi.step(policy.theta_pi, grad)
                 np.maximum(policy.log_std, math.log(opt.min_sigma), out=policy.log_std)
-                self.adam_v.step(policy.critic.theta, v_grad)
                 clipped.append(float(np.mean(np.abs(out["ratio"] - 1.0) > opt.clip_eps)))
-                pi_losses.append(loss), v_losses.append(v_loss)
+                pi_losses.append(loss)
+            v_losses += learnt()
             kl = fmean(kls)
             # ASSUMED: leave the samples before they no longer describe the policy
             if follows_kl and kl > 2.0 * opt.target_kl:
@@ -655,8 +689,6 @@ class Trainer:
             self.adam_pi.lr = max(self.adam_pi.lr / 1.2, 1e-6)
         elif follows_kl and kl < opt.target_kl / 1.3:
             self.adam_pi.lr = min(self.adam_pi.lr * 1.2, 1e-2)
-        if not opt.norm_each_step:
-            policy.norm.update(self.raw)
         self.updates += 1
         return dict(
             kl=kl,
