@@ -23,7 +23,7 @@ import numpy as np
 import mocap
 from character import TERMS, Character, geom_lowest, load
 from mocap import heading, quat_angle
-from retarget import STAGE_VEL, Reference, body_velocity, reference
+from retarget import STAGE_VEL, Reference, body_velocity, headset, reference, standing
 from runs import UserError, rng_from_state, rng_state
 
 ROOT_LIMIT = 0.30  # m  [Reda23 §3.6]; ASSUMED in 3-D
@@ -343,7 +343,7 @@ class Env:
     n         : number of environments
     threads   : physics threads, 0 = all cores; results do not depend on it
     horizon   : control steps to truncation
-    disturbance, balance : `Disturbance`, `_draw`
+    disturbance : `Disturbance`; balance, retry : `_draw`; stand : `_stand`
     asymmetric : the critic's observation has more than the actor's [§5.3]
     autoreset : start anew where an episode ended; without it the caller resets, and reads the state that ended
     """
@@ -365,6 +365,7 @@ class Env:
         balance=False,
         asymmetric=True,
         retry=0.0,
+        stand=0.0,
     ):
         self.char, self.ref, self.n, self.horizon, self.substeps = char, ref, n, horizon, substeps
         self.name, self.training = char.name, char.training
@@ -400,6 +401,7 @@ class Env:
         self.lived = np.full(len(ref.first), float(horizon))
         self.retry = retry
         self.lost = np.zeros(PLACES, int)  # `retry`: frames at which episodes failed of late; 0: none yet
+        self.stand, self.headset = stand, headset(char)
 
     def attach(self, batch):
         """Where the simulations are: state and kinematics as arrays that share their memory."""
@@ -446,11 +448,26 @@ class Env:
         self.frame[ids], self.sequence[ids], self.steps[ids] = f, self.owner[f], 0
         self.available[ids] = np.minimum(self.horizon, self.ref.last[self.owner[f]] - f)
         self.qpos[ids], self.qvel[ids] = self.ref.qpos[f], self.ref.qvel[f]
+        if self.stand and frames is None:
+            self._stand(ids[self.rng.random(len(ids)) < self.stand])
         if self.disturbance.sensor_offset:
             size = self.sensor_error[ids, 0].shape
             self.sensor_error[ids, 0] = self.disturbance.sensor_offset * self.rng.standard_normal(size)
         self.action[ids], self.ctrl[ids], self.warmstart[ids] = 0.0, 0.0, 0.0
         self.refresh(ids)
+
+    def _stand(self, ids):
+        """Environments ids start as a stream does (`stream.Player`): in the default pose under the user's headset, as
+        fast as it; where the root would be too far from the human's (a user who crouches, leans), as before.
+
+        Why       a user who puts the headset on, or whose character has fallen, is not in the default pose
+        Test      tests/test_env.py::test_standing_starts"""
+        ref, f = self.ref, self.frame[ids]
+        pose = standing(self.char, self.headset, ref.sensor_pos[f, 0], ref.sensor_quat[f, 0])
+        near = ~too_far(pose[:, :3], ref.qpos[f, :3])
+        ids, f = ids[near], f[near]
+        self.qpos[ids], self.qvel[ids] = pose[near], 0.0
+        self.qvel[ids, :2] = (ref.sensor_pos[f, 0] - ref.sensor_pos[f - 1, 0])[:, :2] / self.dt
 
     def _draw(self, ids):
         r"""Random start frames for the environments ids.

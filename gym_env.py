@@ -62,7 +62,7 @@ CLEANRL = dict(  # [Huang22] ppo_continuous_action.py; Adam's epsilon and the cl
 )  # fmt: skip
 OF_CHARACTERS = (  # options that mean nothing to a task
     *(f.name for f in fields(character.Switches)), "motion", "clips", "joint_map", "unit", "up", "balance", "retry",
-    "augment", "sensor_offset", "sensor_noise", "push", "episode", "sensors", "without", "track",
+    "stand", "augment", "sensor_offset", "sensor_noise", "push", "episode", "sensors", "without", "track",
 )  # fmt: skip
 
 

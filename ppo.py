@@ -134,6 +134,9 @@ class Options(character.Switches):
     retry: float = arg(
         0.0, "share of episodes that start up to 2 s before a place where one failed of late", check=UNIT
     )
+    stand: float = arg(
+        0.0, "share of episodes that start in the default pose under the headset, as a stream does", check=UNIT
+    )
     augment: bool = arg(False, "also mirrored clips at other speeds, by users of other heights and arm lengths")
     sensor_offset: float = arg(0.0, "constant error of device positions in an episode [m]", check=NONNEGATIVE)
     sensor_noise: float = arg(0.0, "white noise on device positions [m]", check=NONNEGATIVE)
@@ -770,7 +773,7 @@ def make_env(opt: Options) -> Env | Task:
     return Env(
         char, headset_only(ref) if opt.sensors == "hmd" else ref, opt.envs, opt.seed, opt.threads, opt.episode,
         disturbance=disturbance, balance=opt.balance, asymmetric="asymmetric" not in opt.without,
-        retry=opt.retry,
+        retry=opt.retry, stand=opt.stand,
     )  # fmt: skip
 
 

@@ -26,7 +26,9 @@ from mocap import (
     SEG,
     Clip,
     angular_velocity,
+    heading,
     linear_velocity,
+    quat_about,
     quat_conj,
     quat_continuous,
     quat_matrix,
@@ -148,6 +150,21 @@ def headset(char: Character) -> np.ndarray:
     return data.site_xpos[char.sensor_sites[0]].copy()
 
 
+def standing(char: Character, offset, pos, quat) -> np.ndarray:
+    """The default pose under headsets, turned as they look, feet on the floor: where a stream begins.
+
+    Args      offset : `headset` of the character; pos (N, 3) [m], quat (N, 4) of headsets, world
+    Returns   qpos (N, 7 + j)
+    Test      tests/test_stream.py::test_stand, tests/test_env.py::test_standing_starts
+    """
+    turn = quat_about(2, heading(quat))
+    place = pos - quat_rotate(turn, offset)
+    root = quat_mul(turn, char.rest[char.root])
+    n = len(pos)
+    height, pose = np.full((n, 1), char.hip_height), np.broadcast_to(char.default, (n, len(char.default)))
+    return np.concatenate([place[:, :2], height, root, pose], axis=1)
+
+
 def sensor_scale(char: Character, clip: Clip) -> np.ndarray:
     r"""Scale (s_xy, s_xy, s_z) of headset and controller positions  [Reda23 §3.4].
 
@@ -226,7 +243,7 @@ def retarget(char: Character, clip: Clip) -> Pose:
             wanted = quat_mul(quat_mul(quat_conj(done), turn), char.rest[body])
             angles = euler_angles(quat_mul(quat_conj(local), wanted), axes)
         for k, axis in enumerate(axes):
-            local = quat_mul(local, mocap.quat_about("xyz".index(axis), angles[:, k]))
+            local = quat_mul(local, quat_about("xyz".index(axis), angles[:, k]))
         chains[a, b] = quat_mul(done, quat_mul(local, quat_conj(char.rest[body])))
         q[:, hinges] = angles * sign
     inside = np.clip(q, char.ranges[:, 0], char.ranges[:, 1])

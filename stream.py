@@ -33,7 +33,7 @@ import numpy as np
 from character import Character, geom_lowest
 from env import BAD, SUBSTEPS, fallen, observation_terms, observe, slices_of
 from mocap import CONTROL_RATE, heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate, quat_slerp
-from retarget import STAGE_VEL, Reference, headset
+from retarget import STAGE_VEL, Reference, headset, standing
 from runs import UserError, kind_of, parse_number
 
 DEVICES = ("head", "left", "right")
@@ -734,10 +734,7 @@ class Player:
 
     def stand(self, pos, quat):
         """The default pose under a headset.  pos (3, 3), quat (3, 4), world  Test: tests/test_stream.py::test_stand"""
-        turn = quat_about(2, heading(quat[0]))
-        place = pos[0] - quat_rotate(turn, self.headset)
-        turn = quat_mul(turn, self.char.rest[self.char.root])
-        self.qpos[0] = [*place[:2], self.char.hip_height, *turn, *self.char.default]
+        self.qpos[:] = standing(self.char, self.headset, pos[:1], quat[:1])
         for array in (self.qvel, self.ctrl, self.qacc_warmstart, self.xfrc_applied):
             array[0] = 0.0
         self.qvel[0, :2] = (pos[0] - self.before[0][0, 0])[:2] / self.dt if self.before else 0.0

@@ -850,6 +850,34 @@ def test_balanced_starts(char):
         np.testing.assert_array_equal(small.step(a)[0], other.step(a)[0])
 
 
+def test_standing_starts(char):
+    """Under the headset, upright, moving as it does; not where the root would then be too far from the human's."""
+    ref = retarget.reference(char, [c for c in mocap.builtin_clips() if c.name in ("walk_005", "stand_007", "jog_009")])
+    env = Env(char, ref, 400, threads=1, stand=1.0)
+    env.reset(3)
+    f, rest = env.frame, np.abs(env.qpos[:, 7:] - char.default).max(1) < 1e-12
+    sites = env.batch.bind("site_xpos")
+    env.refresh()
+    heads = sites[:, char.sensor_sites[0]]
+    np.testing.assert_allclose(heads[rest, :2], ref.sensor_pos[f, 0, :2][rest], atol=1e-9)
+    low = character.geom_lowest(char.model, char.sole_geoms.ravel(), env.geom_xpos, env.geom_xmat).min(1)
+    assert rest.any() and np.abs(low[rest]).max() < 1e-6
+    speed = np.linalg.norm((ref.sensor_pos[f, 0] - ref.sensor_pos[f - 1, 0])[:, :2], axis=1) * ref.rate
+    np.testing.assert_allclose(np.linalg.norm(env.qvel[rest], axis=1), speed[rest], atol=1e-9)
+    assert not envs.too_far(env.qpos[:, :3], ref.qpos[f, :3]).any()
+    ref.qpos[:, 2] -= 0.4  # all crouch: none can start upright
+    env.reset(3)
+    np.testing.assert_array_equal(env.qpos, ref.qpos[env.frame])
+    ref.qpos[:, 2] += 0.4
+
+    half = Env(char, ref, 400, threads=1, stand=0.5)
+    half.reset(3)
+    share = np.mean(np.abs(half.qpos[:, 7:] - char.default).max(1) < 1e-12)
+    assert 0.3 * rest.mean() < share < 0.7 * rest.mean()
+    half.reset(frames=np.full(400, ref.first[1] + 5))  # a frame that was asked for is taken as it is
+    assert (half.qpos == ref.qpos[ref.first[1] + 5]).all()
+
+
 def test_retried_starts(char):
     """A share of the episodes starts 3 to 59 steps before a remembered failure, in its sequence; the rest anywhere."""
     clips = [c[:n] for c, n in zip(mocap.builtin_clips(), (151, 121, 211), strict=False)]
