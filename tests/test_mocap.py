@@ -988,5 +988,9 @@ def test_augment():
         trunk = other.limb("pelvis", "chest") / clip.limb("pelvis", "chest") / scale
         assert 0.95 <= trunk <= 1.45 and trunk != 1.0
         assert 0.84 <= clip.seconds / other.seconds <= 1.16
+    sprint = [mocap.warp(c, 3.2) for c in clips]
+    assert all(mocap.travel_speed(c) > 3.4 for c in sprint)
+    fast = [mocap.travel_speed(c) for s in range(6) for c in mocap.augment(sprint, np.random.default_rng(s))[2:]]
+    assert max(fast) < 1.02 * mocap.FASTEST and min(fast) < 0.95 * mocap.FASTEST
     plain = mocap.augment(clips, np.random.default_rng(3), 0, 0, 0, (1, 1), (1, 1), 0)
     assert_same(plain[2], mocap.mirror(clips[0]))
