@@ -190,7 +190,8 @@ def physics_table(char, ref, act, envs=256, seconds=1.0, seed=0, threads=0) -> l
     for substeps, solver, iterations in SETTINGS:  # a batch keeps the options that it was made with
         options.solver, options.iterations = getattr(mujoco.mjtSolver, f"mjSOL_{solver}"), iterations
         env = Env(char, ref, envs, seed, threads, substeps=substeps, autoreset=False)
-        env.reset(frames=np.random.default_rng(seed).choice(env.starts[env.starts + steps <= env.starts[-1]], envs))
+        whole = env.starts[env.starts + steps <= ref.last[env.owner[env.starts]]]  # nobody's sequence ends meanwhile
+        env.reset(frames=np.random.default_rng(seed).choice(whole, envs))
         runs.append((env, [], [], np.ones(envs, bool)))
     for _ in range(steps):
         for env, times, depth, alive in runs:

@@ -280,7 +280,7 @@ def ablated(char: Character, without=(), track="all") -> Character:
               orientation stays, which §3.5.1 always rewards
     Args      without : names in WITHOUT; track : one of TRACK
     Returns   a copy; the model is shared
-    Raises    UserError: another name, or nothing left to track
+    Raises    UserError: another name, nothing left to track, or no reward left
     Test      tests/test_env.py::test_ablated
     """
     for name in without:
@@ -294,7 +294,12 @@ def ablated(char: Character, without=(), track="all") -> Character:
             raise UserError("--track root imitates x of the root: it needs x's weight, and no --without imitation")
         gone |= {"q", "qd", "xd"}
         char = replace(char, reward_links=np.array([char.root]), link_weights=np.ones(1))
-    return replace(char, reward=char.reward | {term: (0.0, char.reward[term][1]) for term in gone})
+    less = replace(char, reward=char.reward | {term: (0.0, char.reward[term][1]) for term in gone})
+    if not any(less.reward[term][0] for term in TERMS):
+        raise UserError(
+            f"--without {','.join(without)}: no reward is left; valid: leave one term that weighs something"
+        )
+    return less
 
 
 # ------------------------------------------------------------------------------------ termination
@@ -461,6 +466,7 @@ class Env:
         fast as it; where the root would be too far from the human's (a user who crouches, leans), as before.
 
         Why       a user who puts the headset on, or whose character has fallen, is not in the default pose
+        Note      with `balance` a failure of such a start counts as one of the sequence that it was in
         Test      tests/test_env.py::test_standing_starts"""
         ref, f = self.ref, self.frame[ids]
         pose = standing(self.char, self.headset, ref.sensor_pos[f, 0], ref.sensor_quat[f, 0])
@@ -720,7 +726,7 @@ def as_gymnasium(char="jesse", ref: Reference | None = None, n: int | None = Non
 
     Args      char : a Character, or what `character.load` takes; ref : the motions, the built-in ones by default
               n : None for one character, a gymnasium.Env; a number for as many, a gymnasium.vector.VectorEnv
-              settings : of `Env`: seed, threads, horizon, substeps, disturbance, balance, asymmetric
+              settings : of `Env`: seed, threads, horizon, substeps, disturbance, balance, retry, stand, asymmetric
     Raises    UserError: gymnasium is not installed, or no such character
     Test      tests/test_gym_env.py::test_check_env, test_vector_is_the_environment
     """

@@ -112,6 +112,9 @@ class Generator:
     def random(self, size):
         return self.own.random(size)
 
+    def integers(self, low, high=None, size=None):
+        return self.own.integers(low, high, size)
+
     def uniform(self, low, high, size):
         return low + (high - low) * self.own.random(size)
 

@@ -71,8 +71,12 @@ def head_rates(quat, rate):
 
 
 def sip_bodies(char: Character):
-    """Upper arms and thighs, from the TOML's [metrics] table.  Test: tests/test_metrics.py::test_sip_bodies"""
-    m, names = char.model, char.spec.get("metrics", {}).get("sip", [])
+    """Upper arms and thighs, from the TOML's [metrics] table; without that table none, and `sip_deg` is NaN.
+
+    Test      tests/test_metrics.py::test_sip_bodies"""
+    if "metrics" not in char.spec:
+        return np.array([], int)
+    m, names = char.model, char.spec["metrics"].get("sip", [])
     found = [mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, str(n)) for n in names]
     if not found or min(found) < 0:
         valid = ", ".join(m.body(b).name for b in range(1, m.nbody))

@@ -332,7 +332,9 @@ class Arm:
     def title(self) -> str:
         """What it is, in a line.  Test: tests/test_play.py::test_compare"""
         options, parts = self.meta.get("options", {}), [name_of(self.char)]
-        parts += [f"{fmt_count(self.meta['steps'])} steps"] if isinstance(self.meta.get("steps"), int) else []
+        if isinstance(self.meta.get("steps"), int):
+            since = f" since {options['init']}" if options.get("init") else ""
+            parts.append(f"{fmt_count(self.meta['steps'])} steps{since}")
         parts += [f"without {' '.join(map(str, options['without']))}"] if options.get("without") else []
         parts += ["root tracked only"] if options.get("track") == "root" else []
         if sensors_of(self.meta, self.path) == "hmd":

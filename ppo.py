@@ -111,7 +111,9 @@ class Options(character.Switches):
     )
     init: str | None = arg(None, "start from the weights of a policy (.npz) or a run folder")
     gpu: bool = arg(False, "train on an NVIDIA GPU (extra gpu); give thousands of --envs")
-    threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
+    threads: int = arg(
+        0, "physics threads, 0 = all cores; if not 1, actor and critic learn side by side", check=THREADS
+    )
     checkpoint_minutes: float = arg(3.0, "minutes between checkpoints", check=NONNEGATIVE)
     gamma: float = arg(0.97, "discount (QuestSim's)", check=UNIT)
     lam: float = arg(0.95, "lambda of generalised advantage estimation; 1 is Appendix B's return", check=UNIT)
@@ -475,6 +477,14 @@ def blended(policy: Policy, others: list[Policy], share: float) -> Policy:
     return policy
 
 
+def _body(meta) -> tuple:
+    """Which body a policy was trained with: the character and its variation, rewards left out."""
+    o = meta.get("options", {})
+    changes = {c.strip() for c in (o.get("set") or "").split(";")}
+    body = sorted(c for c in changes if c and not c.startswith("reward"))
+    return Path(o.get("character") or "").stem, o.get("tail"), o.get("scale", 1.0), *body
+
+
 def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     """Write a run's policy for others to play: weights, normaliser, how it was trained, its data's licence.
 
@@ -488,6 +498,8 @@ def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     policy, meta = load_policy(run)
     loaded = [load_policy(p) for p in blend]
     try:
+        if odd := [str(p) for p, (_, m) in zip(blend, loaded, strict=True) if _body(m) != _body(meta)]:
+            raise ValueError(f"{', '.join(odd)}: another body or pose than {_body(meta)}")
         policy = blended(policy, [p for p, _ in loaded], share) if blend else policy
     except ValueError as e:
         raise UserError(
@@ -967,6 +979,8 @@ def main(argv=None):
     of_gym = any(a.split("=")[0] == "--gym" for a in argv)
     opt = cli(with_defaults_of_cleanrl(Options) if of_gym else Options, argv, "ppo.py", __doc__)
     opt = replace(opt, out=opt.out or f"runs/{Path(opt.gym or opt.character).stem}")
+    if not opt.ship and (opt.blend or opt.gain != 1.0):
+        raise UserError("--blend and --gain are of --ship FILE.npz: give it, or leave them out")
     if opt.ship:
         meta = ship(opt.out, opt.ship, opt.blend, opt.share, opt.gain)
         print(f"{opt.ship}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}; {meta['licence']}")

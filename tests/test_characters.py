@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from test_retarget import MINI_TOML, MINI_XML, clip_of, posed, random_states
 
 import character
+import metrics
+import play
 import retarget
 import runs
 from character import CHARACTERS
@@ -650,7 +652,10 @@ def test_fourth_character(tmp_path, capsys):
     d = posed(c.model, pose.qpos[20])
     human = Rotation.from_quat(clip.quat[20, 0], scalar_first=True)  # pelvis
     assert (Rotation.from_quat(d.xquat[c.root], scalar_first=True).inv() * human).magnitude() < 1e-6
-    env = Env(c, retarget.reference(c, [clip]), 4, threads=1)
+    ref = retarget.reference(c, [clip])
+    row = metrics.measure(c, ref, play.kinematic(c, ref))
+    assert row["root_cm"] == 0.0 and np.isnan(row["sip_deg"]) and "| - |" in metrics.table({"kinematic": row})
+    env = Env(c, ref, 4, threads=1)
     obs, _ = env.reset(0)
     start = env.reward_terms(np.zeros((4, env.action_size)))
     assert all(np.all(start[t] > 0.9 * c.reward[t][0]) for t in ("q", "x"))  # it starts where the reference is

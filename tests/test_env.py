@@ -364,6 +364,8 @@ def test_ablated(shared, char, clips, ref, rng):
         assert terms["x"][i] == pytest.approx(w * math.exp(-k * d), rel=1e-6)
         assert terms["orientation"][i] == pytest.approx(info["terms"]["orientation"][i])
     assert len(char.reward_links) == 6  # the argument is as it was
+    with pytest.raises(UserError, match="no reward is left"):
+        envs.ablated(char, ["imitation", "orientation", "action", "contact"])
     for wrong in ({"without": ["gravity"]}, {"track": "head"}, {"without": ["imitation"], "track": "root"}):
         with pytest.raises(UserError, match="valid: contact, orientation, action|valid: all, root|no --without im"):
             envs.ablated(char, **wrong)

@@ -8,7 +8,7 @@ import character
 import gpu
 import nn
 import ppo
-from env import Env
+from env import Disturbance, Env
 from runs import UserError, load_checkpoint, run_main
 
 pytestmark = pytest.mark.usefixtures("motions_once")
@@ -74,6 +74,17 @@ def test_moved_trainer_sees_the_same(char, ref):
     np.testing.assert_array_equal(infos[0][2], infos[1][2])
     assert gone.policy.actor.theta.base is gone.policy.log_std.base is gone.policy.theta_pi  # still one vector
     assert gone.steps == stayed.steps == 12
+
+
+def test_generator_draws_what_the_environment_asks_for(char, ref):
+    """Every switch that draws random numbers finds them in the GPU's generator."""
+    env = Env(char, ref, 8, threads=1, balance=True, retry=0.5, stand=0.5, disturbance=Disturbance(0.1, 0.1, 1.0))
+    env.rng = gpu.Generator(np, 0)
+    env.reset()
+    env.lost[:] = ref.first[0] + 20
+    for _ in range(30):
+        env.step(env.rng.standard_normal((8, env.action_size), dtype=np.float32))
+    assert env.lost.min() > 0 and env.rng.permutation(5).size == 5
 
 
 def test_swap_ends(char, ref):

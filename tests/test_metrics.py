@@ -322,6 +322,8 @@ def test_a_real_first_step_failure(char, ref):
 def test_sip_bodies(char):
     names = {char.model.body(b).name for b in metrics.sip_bodies(char)}
     assert names == {"upper_arm_l", "upper_arm_r", "thigh_l", "thigh_r"}
+    spec = {k: v for k, v in char.spec.items() if k != "metrics"}
+    assert not len(metrics.sip_bodies(replace(char, spec=spec)))
     for table in ({"sip": ["thigh_l", "wing"]}, {"sip": []}, {}):
         with pytest.raises(UserError, match=r"jesse.toml: \[metrics\] sip.*thigh_l"):
             metrics.sip_bodies(replace(char, spec=char.spec | {"metrics": table}))

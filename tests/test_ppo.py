@@ -884,7 +884,15 @@ def test_blended(tmp_path):
     assert ppo.ship(other, tmp_path / "again.npz")["licence"] == ppo.load_policy(other)[1]["licence"]
     with pytest.raises(UserError, match="--blend .*: networks .*; valid: policies of one ancestor with "):
         ppo.ship(paths[1], tmp_path / "c.npz", [other])
-    assert not (tmp_path / "c.npz").exists()
+    arrays, meta = load_checkpoint(paths[0] / CHECKPOINT, ("policy.*",))
+    save_checkpoint(tmp_path / "bent.npz", arrays, meta | {"options": meta["options"] | {"set": "pose.spine_y=0.2"}})
+    with pytest.raises(UserError, match="bent.npz: another body or pose"):
+        ppo.ship(paths[1], tmp_path / "c.npz", [tmp_path / "bent.npz"])
+    save_checkpoint(tmp_path / "less.npz", arrays, meta | {"options": meta["options"] | {"set": "reward.q=[0, 1]"}})
+    ppo.ship(paths[1], tmp_path / "d.npz", [tmp_path / "less.npz"])  # another reward is the same body
+    with pytest.raises(UserError, match="--blend and --gain are of --ship"):
+        ppo.main(["--blend", str(paths[0]), "--out", str(tmp_path / "never")])
+    assert not (tmp_path / "c.npz").exists() and not (tmp_path / "never").exists()
 
 
 def test_ship(tmp_path, monkeypatch):
