@@ -404,3 +404,20 @@ def test_run_main_reports_only_what_the_user_did(capsys):
 
     with pytest.raises(ZeroDivisionError):
         runs.run_main(broken, [])
+
+
+@pytest.mark.parametrize(
+    "flags, says",
+    [
+        (
+            "--stream x.csv --motion builtin --user-scale 1.2",
+            "--motion, --user-scale are of a motion, and --stream has none",
+        ),
+        ("--measure --axes openxr --realtime", "--axes, --realtime are of --stream FILE"),
+    ],
+)
+def test_play_flags_that_would_do_nothing(flags, says, capsys):
+    """Said before anything is read, not passed over."""
+    with pytest.raises(SystemExit) as stopped:
+        runs.run_main(play.main, flags.split())
+    assert stopped.value.code != 0 and says in capsys.readouterr().err
