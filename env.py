@@ -406,7 +406,7 @@ class Env:
         self.lived = np.full(len(ref.first), float(horizon))
         self.retry = retry
         self.lost = np.zeros(PLACES, int)  # `retry`: frames at which episodes failed of late; 0: none yet
-        self.stand, self.headset = stand, headset(char)
+        self.stand, self.headset = stand, headset(char) if stand else None
 
     def attach(self, batch):
         """Where the simulations are: state and kinematics as arrays that share their memory."""

@@ -53,6 +53,10 @@ from runs import (
 )
 from stream import AXES, SAMPLE_RATE
 
+# flags that say something of a motion alone, or of a stream alone
+OF_MOTION = {"motion", "clips", "joint_map", "unit", "up", "all", "split", "user_scale", "random_starts", "sequence"}
+OF_STREAM = {"axes", "grip", "sample_rate", "user_height", "realtime"}
+
 
 @dataclass
 class Options(character.Switches):
@@ -147,10 +151,6 @@ def pd_action(env: Env):
 
 PUSH_SECONDS = 0.2
 RECOVERY = 3.0  # s after the push that the character must live, to have survived it
-# flags that say something of a motion alone, or of a stream alone
-OF_MOTION = {"motion", "clips", "joint_map", "unit", "up", "all", "split", "user_scale", "random_starts", "sequence"}
-OF_STREAM = {"axes", "grip", "sample_rate", "user_height", "realtime"}
-
 DIRECTIONS = {"forward": 0.0, "left": np.pi / 2, "back": np.pi, "right": -np.pi / 2}
 
 
@@ -701,14 +701,10 @@ def main(argv=None):
         plain, others = Options(), "policy character tail scale set stream view video bvh push".split()
         if wrong := [f"--{k}" for k in others if getattr(opt, k) != getattr(plain, k)]:
             raise UserError(f"--compare takes policies with their own characters: leave out {', '.join(wrong)}")
-    given = given_flags(argv)
-    for wrong, says in (
-        (given & OF_MOTION if opt.stream else set(), "are of a motion, and --stream has none"),
-        (set() if opt.stream else given & OF_STREAM, "are of --stream FILE"),
-    ):
-        if wrong:
-            flags = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(wrong))
-            raise UserError(f"{flags} {says}: leave out the one or the other")
+    if wrong := given_flags(argv) & (OF_MOTION if opt.stream else OF_STREAM):
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(wrong))
+        says = "are of a motion, and --stream has none" if opt.stream else "are of --stream FILE"
+        raise UserError(f"{flags} {says}: leave out the one or the other")
     if opt.stream and opt.bvh:
         raise UserError("--bvh records a motion, not a stream; give one of the two")
     if opt.stream and opt.measure:

@@ -477,12 +477,18 @@ def blended(policy: Policy, others: list[Policy], share: float) -> Policy:
     return policy
 
 
-def _body(meta) -> tuple:
-    """Which body a policy was trained with: the character and its variation, rewards left out."""
-    o = meta.get("options", {})
-    changes = {c.strip() for c in (o.get("set") or "").split(";")}
-    body = sorted(c for c in changes if c and not c.startswith("reward"))
-    return Path(o.get("character") or "").stem, o.get("tail"), o.get("scale", 1.0), *body
+def _body(meta, path) -> tuple:
+    """Which body a policy was trained with: the character and its variation, rewards left out; () of none named."""
+    own = trained_as(meta, path)
+    if own is None:
+        return ()
+    changes = {c.strip() for c in (own.set or "").split(";")}
+    return (
+        Path(own.character).stem,
+        own.tail,
+        own.scale,
+        *sorted(c for c in changes if c and not c.startswith("reward")),
+    )
 
 
 def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
@@ -498,8 +504,9 @@ def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     policy, meta = load_policy(run)
     loaded = [load_policy(p) for p in blend]
     try:
-        if odd := [str(p) for p, (_, m) in zip(blend, loaded, strict=True) if _body(m) != _body(meta)]:
-            raise ValueError(f"{', '.join(odd)}: another body or pose than {_body(meta)}")
+        own = _body(meta, run)
+        if odd := [str(p) for p, (_, m) in zip(blend, loaded, strict=True) if _body(m, p) != own]:
+            raise ValueError(f"{', '.join(odd)}: another body or pose than {own}")
         policy = blended(policy, [p for p, _ in loaded], share) if blend else policy
     except ValueError as e:
         raise UserError(
@@ -512,7 +519,7 @@ def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     sets = mocap.parts(motion)
     licences = [f"weights trained on {text}" for text in mocap.licences(sets)]
     if "licence" in meta:  # was shipped before
-        licences = [t for t in [str(meta["licence"])] if t != "MIT"]
+        licences = [str(meta["licence"])] if meta["licence"] != "MIT" else []
     kept = {k: meta[k] for k in ("policy", "steps", "data")}
     init = meta["options"]["init"] and Path(meta["options"]["init"]).name
     kept["options"] = meta["options"] | {"motion": ",".join(Path(s).name for s in sets), "out": None, "init": init}
