@@ -117,8 +117,9 @@ def bench(char, ref, opt: Options) -> dict:
     """
     settings = ppo.Options(envs=opt.envs, threads=opt.threads)
     env = Env(char, ref, opt.envs, threads=opt.threads)
-    trainer = ppo.Trainer(settings, env)
+    trainer = ppo.Trainer(settings, *ppo.environments(char, ref, settings))
     trainer.start()
+    env.reset()
     trainer.collect(), trainer.update()  # warm
     rng = np.random.default_rng(0)
     physics = Physics(Env(char, ref, opt.envs, threads=opt.threads), rng)
@@ -399,7 +400,7 @@ def torch_update(trainer: ppo.Trainer):
     """
     import torch
 
-    opt, policy, rng = trainer.opt, trainer.policy, rng_from_state(rng_state(trainer.rng))
+    opt, policy, rng = trainer.opt, trainer.policy, rng_from_state(rng_state(trainer.rngs[0]))
     if opt.joint_clip or opt.value_clip or opt.standardise_minibatch or opt.schedule != "linear":
         raise ValueError("only the paper's losses, with a linear schedule, are written in PyTorch")
     nets = []
@@ -474,7 +475,7 @@ def bench_peers(char, ref, opt: Options) -> dict:
         raise UserError(gym_env.NO_SB3) from None
     # a schedule by KL divergence could leave out epochs
     settings = ppo.Options(envs=opt.envs, threads=opt.threads, schedule="linear", steps=10**9)
-    trainer = ppo.Trainer(settings, Env(char, ref, opt.envs, threads=opt.threads))
+    trainer = ppo.Trainer(settings, *ppo.environments(char, ref, settings))
     trainer.start()
     trainer.collect()
     by_torch = torch_update(trainer)

@@ -138,7 +138,7 @@ def moved(trainer, device="cuda"):
         # one stream for both libraries, or neither would wait for the other's results
         trainer.stream = xp.cuda.ExternalStream(worlds.warp.get_stream(device).cuda_stream)
         trainer.stream.use()
-        trainer.rng, env.rng = (Generator(xp, [trainer.opt.seed, k]) for k in (11, 12))
+        trainer.rngs[0], env.rng = (Generator(xp, [trainer.opt.seed, k]) for k in (11, 12))
     policy = trainer.policy
     single = env.char, env.ref, env  # float64 of thousands of characters would cost as much as their physics
     for part in (*single, policy.norm, trainer.adam_pi, trainer.adam_v, trainer):

@@ -20,6 +20,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 
@@ -79,7 +80,7 @@ from runs import (
     versions,
 )
 
-FINITE = ("policy.*", "adam_*", "env.*")  # of a checkpoint's arrays
+FINITE = ("policy.*", "adam_*", "env*")  # of a checkpoint's arrays
 WEIGHT_LIMIT, NORM_LIMIT = 1e6, 1e30  # no weight of a policy, no sum of its normaliser is larger: float32 stays finite
 BELOW_ONE = (lambda v: 0 < v < 1, "between 0 and 1")
 NOISE = {"sigma": 0.135, "min_sigma": 0.05}  # where neither the command line nor the character's [training] says
@@ -270,6 +271,7 @@ def explained_variance(value, target):
 # ------------------------------------------------------------------------------------ two cores
 
 SECOND = ThreadPoolExecutor(1)  # `aside`; its thread begins with the first use
+HALVES = 64  # `environments`; fewer characters are one batch, whose physics takes no longer than what is around it
 
 
 def aside(work, two=True):
@@ -550,13 +552,18 @@ def check_fits(policy: Policy, env: Env, path):
 class Trainer:
     """Collect, estimate, update; all state that a resumed run needs.
 
+    envs : one, or the two halves of `environments`; env : the first, which knows all sizes; n : characters in all
+    rngs : of each one's exploration; the first draws the minibatches, too
     Test      tests/test_ppo.py::test_resume_is_exact, test_learns, test_non_finite_state_does_not_reach_the_networks
     """
 
-    def __init__(self, opt: Options, env: Env | Task):
+    def __init__(self, opt: Options, *envs: Env | Task):
+        env = envs[0]
         noise = {k: v for k, v in (NOISE | env.training).items() if getattr(opt, k) is None}
-        self.opt, self.env = (opt := replace(opt, **noise)), env
-        self.rng = np.random.default_rng([opt.seed, 1])
+        self.opt, self.env, self.envs = (opt := replace(opt, **noise)), env, envs
+        ends = np.cumsum([e.n for e in envs])
+        self.n, self.rows = int(ends[-1]), [slice(int(end) - e.n, int(end)) for end, e in zip(ends, envs, strict=True)]
+        self.rngs = [np.random.default_rng([opt.seed, 1, k]) for k in range(len(envs))]
         sizes = (env.obs_size, env.critic_size, env.action_size)
         self.policy = Policy(
             *sizes, opt.hidden, opt.value_hidden, opt.sigma, env.value_scale(opt.gamma),
@@ -565,7 +572,7 @@ class Trainer:
         self.adam_pi = Adam(self.policy.theta_pi.size, opt.lr, eps=opt.adam_eps)
         self.adam_v = Adam(self.policy.critic.theta.size, opt.value_lr, eps=opt.adam_eps)
         self.steps = self.updates = 0
-        t, n = opt.horizon, env.n
+        t, n = opt.horizon, self.n
         self.x = np.zeros((t, n, env.critic_size), np.float32)  # normalised observations
         self.raw = np.zeros((t, n, env.critic_size), np.float32)
         self.action, self.mu = (np.zeros((t, n, env.action_size), np.float32) for _ in range(2))
@@ -574,51 +581,32 @@ class Trainer:
         self.terminated, self.truncated = np.zeros((t, n), bool), np.zeros((t, n), bool)
         self.two = opt.threads != 1 and opt.minibatch >= 1024
 
+    @property
+    def full(self):
+        """The present observations of all characters.  (n, critic_size)"""
+        return self.env.full if len(self.envs) == 1 else np.concatenate([e.full for e in self.envs])
+
     def start(self):
         """First observation; the normaliser begins with it, or the first update would see unscaled inputs."""
-        self.env.reset(None if self.opt.gpu else self.opt.seed)  # the GPU's random numbers have their seed already
+        for k, env in enumerate(self.envs):  # the GPU's random numbers have their seed already
+            env.reset(None if self.opt.gpu else [self.opt.seed, k] if k else self.opt.seed)
         if self.policy.norm.count == 0:
-            self.policy.norm.update(self.env.full)
+            self.policy.norm.update(self.full)
 
     def collect(self) -> dict:
         """`horizon` steps of every environment with the present policy.  -> what happened, for the progress line
 
-        Test      tests/test_ppo.py::test_stored_action_is_unclipped
+        Test      tests/test_ppo.py::test_stored_action_is_unclipped, test_second_thread_changes_nothing
         """
-        env, policy, norm = self.env, self.policy, self.policy.norm
-        finals = []  # (t, ids, rows): observations at truncations, before the reset
-        sums = dict.fromkeys(env.TERMS, 0.0)
-        ends = dict.fromkeys(env.ENDS, 0)
-        lengths, shares = [], []
-        sigma = np.exp(policy.log_std)
-        for t in range(self.opt.horizon):
-            self.raw[t] = env.full
-            x = norm.normalise(env.full, out=self.x[t])
-            mu = policy.actor(x[:, : env.obs_size])
-            noise = self.rng.standard_normal(mu.shape, dtype=np.float32)
-            a = mu + sigma * noise
-            self.mu[t], self.action[t] = mu, a
-            _, r, terminated, truncated, info = env.step(a)
-            self.reward[t], self.terminated[t], self.truncated[t] = r, terminated, truncated
-            if self.opt.norm_each_step:
-                norm.update(env.full)
-            if truncated.any():
-                ids = np.flatnonzero(truncated)
-                finals.append((t, ids, norm.normalise(info["final_critic"][ids])))
-            for name in sums:
-                sums[name] += float(info["terms"][name].mean())
-            for name in ends:
-                ends[name] += int(info["ends"][name].sum())
-            done = terminated | truncated
-            lengths.append(info["length"][done])
-            shares.append((info["length"] / info["available"])[done])
-        self.steps += self.opt.horizon * env.n
-        flat = (-1, env.action_size)
-        logp = gaussian_logp(self.action.reshape(flat), self.mu.reshape(flat), policy.log_std)
+        later = [aside(partial(self._simulate, k), self.opt.threads != 1) for k in range(1, len(self.envs))]
+        finals, sums, ends, lengths, shares = zip(self._simulate(0), *(wait() for wait in later), strict=True)
+        self.steps += self.opt.horizon * self.n
+        flat = (-1, self.env.action_size)
+        logp = gaussian_logp(self.action.reshape(flat), self.mu.reshape(flat), self.policy.log_std)
         self.logp[:] = logp.reshape(self.logp.shape)
-        self._values(finals)
+        self._values([f for part in finals for f in part])
         lengths, shares = np.concatenate(lengths), np.concatenate(shares)
-        seconds = self.opt.horizon * env.n * env.dt
+        seconds = self.opt.horizon * self.n * self.env.dt
         stats = dict(
             episodes=len(lengths),
             length=float(lengths.mean()) if len(lengths) else float("nan"),
@@ -626,19 +614,55 @@ class Trainer:
             time_to_failure=seconds / max(int(self.terminated.sum()), 1),
             reward=float(self.reward.mean()),
         )
-        stats |= {f"r_{k}": v / self.opt.horizon for k, v in sums.items()}
-        return stats | {f"end_{k}": v for k, v in ends.items()} | env.stats()
+        stats |= {f"r_{k}": sum(part[k] for part in sums) / (self.opt.horizon * self.n) for k in self.env.TERMS}
+        return stats | {f"end_{k}": sum(part[k] for part in ends) for k in self.env.ENDS} | self.env.stats()
+
+    def _simulate(self, k):
+        """Environment k's steps, stored in its rows of the samples; nothing else that is shared changes.
+
+        Returns   finals : (step, rows, normalised observations) at truncations, before the reset
+                  sums : reward terms over steps and characters; ends : episodes by their end
+                  lengths, shares : of the episodes that ended, steps lived and their share of those there were
+        """
+        env, policy, norm, rng, rows = self.envs[k], self.policy, self.policy.norm, self.rngs[k], self.rows[k]
+        finals, lengths, shares = [], [], []
+        sums, ends = dict.fromkeys(env.TERMS, 0.0), dict.fromkeys(env.ENDS, 0)
+        sigma = np.exp(policy.log_std)
+        for t in range(self.opt.horizon):
+            self.raw[t, rows] = env.full
+            x = norm.normalise(env.full, out=self.x[t, rows])
+            mu = policy.actor(x[:, : env.obs_size])
+            noise = rng.standard_normal(mu.shape, dtype=np.float32)
+            a = mu + sigma * noise
+            self.mu[t, rows], self.action[t, rows] = mu, a
+            _, r, terminated, truncated, info = env.step(a)
+            self.reward[t, rows], self.terminated[t, rows], self.truncated[t, rows] = r, terminated, truncated
+            if self.opt.norm_each_step:
+                norm.update(env.full)
+            if truncated.any():
+                ids = np.flatnonzero(truncated)
+                finals.append((t, rows.start + ids, norm.normalise(info["final_critic"][ids])))
+            for name in sums:
+                sums[name] += float(info["terms"][name].sum())
+            for name in ends:
+                ends[name] += int(info["ends"][name].sum())
+            done = terminated | truncated
+            lengths.append(info["length"][done])
+            shares.append((info["length"] / info["available"])[done])
+        return finals, sums, ends, np.concatenate(lengths), np.concatenate(shares)
 
     def _values(self, finals):
         """V(o_t) and V(o_{t+1}) of everything collected, with the old network.
 
         Test      tests/test_ppo.py::test_bootstrap_is_before_the_reset
         """
-        env, policy = self.env, self.policy
+        policy = self.policy
         t, n = self.reward.shape
         self.old_value = policy.value(self.x.reshape(t * n, -1), two=self.two).reshape(t, n)
         self.next_value[:-1] = self.old_value[1:]
-        self.next_value[-1] = policy.value(policy.norm.normalise(env.full))  # App. B: bootstrap at the trajectory's end
+        self.next_value[-1] = policy.value(
+            policy.norm.normalise(self.full)
+        )  # App. B: bootstrap at the trajectory's end
         for step, ids, rows in finals:  # truncation is not failure
             self.next_value[step, ids] = policy.value(rows)
         self.next_value[self.terminated] = 0.0
@@ -678,7 +702,7 @@ class Trainer:
             return loss
 
         for epoch in range(opt.epochs):
-            order = self.rng.permutation(samples)
+            order = self.rngs[0].permutation(samples)
             batches = [order[start : start + opt.minibatch] for start in range(0, samples, opt.minibatch)]
             kls, apart = [], [] if opt.joint_clip else batches
             learnt = aside(lambda apart=apart: [critic_step(rows) for rows in apart], self.two)
@@ -732,11 +756,14 @@ class Trainer:
         if self.opt.gpu:  # the policy alone: --init goes on from it
             save_checkpoint(path, gpu.fetched(self.policy.arrays()), meta | own)
             return
-        env_arrays, env_meta = self.env.state()
-        arrays = self.policy.arrays() | {f"env.{k}": v for k, v in env_arrays.items()}
+        arrays, rest = self.policy.arrays(), dict(rng=[rng_state(r) for r in self.rngs], env=[])
+        for k, env in enumerate(self.envs):
+            env_arrays, env_meta = env.state()
+            arrays |= {f"env{k}.{name}": v for name, v in env_arrays.items()}
+            rest["env"].append(env_meta)
         for name, adam in (("adam_pi", self.adam_pi), ("adam_v", self.adam_v)):
             arrays |= {f"{name}.{k}": v for k, v in adam.state().items()}
-        save_checkpoint(path, arrays, meta | own | dict(rng=rng_state(self.rng), env=env_meta))
+        save_checkpoint(path, arrays, meta | own | rest)
 
     def restore(self, arrays, meta, path="the checkpoint"):
         """Continue bit-exactly from what `save` wrote.  UserError, naming path: something else was saved"""
@@ -755,8 +782,10 @@ class Trainer:
                     raise ValueError(f"{name}.v is negative")
                 adam.load_state(state)
             self.adam_pi.lr, self.steps, self.updates = meta["lr"], meta["steps"], meta["updates"]
-            self.rng = rng_from_state(meta["rng"])
-            self.env.load_state({k[4:]: v for k, v in arrays.items() if k.startswith("env.")}, meta["env"])
+            self.rngs = [rng_from_state(r) for _, r in zip(self.envs, meta["rng"], strict=True)]
+            for k, (env, own) in enumerate(zip(self.envs, meta["env"], strict=True)):
+                prefix = f"env{k}."
+                env.load_state({n.removeprefix(prefix): v for n, v in arrays.items() if n.startswith(prefix)}, own)
         except (KeyError, TypeError, ValueError) as e:
             raise UserError(
                 f"{path}: does not fit this run ({type(e).__name__}: {e}); give another --out, with --init {path}"
@@ -773,27 +802,49 @@ def fingerprint(ref) -> str:
     return hashlib.sha256(np.ascontiguousarray(ref.qpos)).hexdigest()[:16]
 
 
-def make_env(opt: Options) -> Env | Task:
-    """Character, stitched training sequences, augmented if asked for, environment.  Or Gymnasium's task.
+def environments(char, ref, opt: Options) -> list[Env]:
+    """A run's characters, as two halves if there are many: one half is observed while the other's physics runs.
 
-    Test      tests/test_ppo.py::test_make_env_augments, tests/test_gym_env.py::test_wrong_tasks
+    What is trained does not depend on how many threads do it.
+    Test      tests/test_ppo.py::test_halves, test_second_thread_changes_nothing"""
+    sizes = [opt.envs - opt.envs // 2, opt.envs // 2]
+    if opt.envs < HALVES or opt.gpu or opt.norm_each_step:
+        sizes = [opt.envs]
+    disturbance = Disturbance(opt.sensor_offset, opt.sensor_noise, opt.push)
+    return [
+        Env(
+            char,
+            ref,
+            n,
+            [opt.seed, k],
+            opt.threads,
+            opt.episode,
+            disturbance=disturbance,
+            balance=opt.balance,
+            asymmetric="asymmetric" not in opt.without,
+            retry=opt.retry,
+            stand=opt.stand,
+        )  # fmt: skip
+        for k, n in enumerate(sizes)
+    ]
+
+
+def make_envs(opt: Options) -> list[Env] | list[Task]:
+    """Character, stitched training sequences, augmented if asked for, environments.  Or Gymnasium's task.
+
+    Test      tests/test_ppo.py::test_make_envs_augments, tests/test_gym_env.py::test_wrong_tasks
     """
     if opt.gym:
         character_only(opt, Options())
-        return Task(opt.gym, opt.envs, opt.seed, opt.gamma, opt.reward_norm, opt.limit_ends)
+        return [Task(opt.gym, opt.envs, opt.seed, opt.gamma, opt.reward_norm, opt.limit_ends)]
     if opt.reward_norm or opt.limit_ends:
         raise UserError("--reward-norm and --limit-ends are of tasks: give --gym, or leave them out")
     char = ablated(opt.load(), opt.without, opt.track)
     clips = mocap.sequences(opt.motion, "train", opt.clips, seed=opt.seed, reading=Reading.of(opt))
     if opt.augment:
         clips = mocap.augment(clips, np.random.default_rng([opt.seed, 3]))
-    disturbance = Disturbance(opt.sensor_offset, opt.sensor_noise, opt.push)
     ref = retarget.reference(char, clips)
-    return Env(
-        char, headset_only(ref) if opt.sensors == "hmd" else ref, opt.envs, opt.seed, opt.threads, opt.episode,
-        disturbance=disturbance, balance=opt.balance, asymmetric="asymmetric" not in opt.without,
-        retry=opt.retry, stand=opt.stand,
-    )  # fmt: skip
+    return environments(char, headset_only(ref) if opt.sensors == "hmd" else ref, opt)
 
 
 def initial_policy(path, env: Env, sigma) -> Policy:
@@ -897,9 +948,8 @@ def train(opt: Options) -> Trainer:
     began = time.perf_counter()
     check_run(out, opt.resume)
     # The configuration is checked and the motions are read before the folder is made: a typo leaves nothing behind.
-    env = make_env(opt)
-    trainer = Trainer(opt, env)
-    opt = trainer.opt
+    trainer = Trainer(opt, *make_envs(opt))
+    opt, env = trainer.opt, trainer.env
     if opt.init and not loaded:  # a run resumed before its first checkpoint begins as it began
         policy = initial_policy(opt.init, env, opt.sigma)
         trainer.policy.begin_from(policy, opt.init, np.random.default_rng([opt.seed, 4]))
@@ -947,7 +997,7 @@ def _loop(trainer: Trainer, loaded, meta, seconds):
             t1 = time.perf_counter()
             stats |= trainer.update()
             t2 = time.perf_counter()
-            stats |= {"steps_per_s": opt.horizon * env.n / (t2 - t0), "collect_s": t1 - t0, "update_s": t2 - t1}
+            stats |= {"steps_per_s": opt.horizon * trainer.n / (t2 - t0), "collect_s": t1 - t0, "update_s": t2 - t1}
             metrics.append({"update": trainer.updates, "steps": trainer.steps} | stats)
             progress.update(trainer.steps, progress_line(stats))
             if t2 - saved >= 60 * opt.checkpoint_minutes:

@@ -330,7 +330,7 @@ def small_options(**changes):
 def test_learns():
     """The same Trainer, with CleanRL's switches, learns a task of Gymnasium's."""
     opt = small_options(steps=128 * 70)
-    trainer = ppo.Trainer(opt, ppo.make_env(opt))
+    trainer = ppo.Trainer(opt, *ppo.make_envs(opt))
     trainer.start()
     history = [trainer.collect() | trainer.update() for _ in range(70)]
     assert history[2]["return_100"] < 4.0 < 7.0 < history[-1]["return_100"]  # of 12 at most
@@ -342,7 +342,7 @@ def test_time_limit_is_bootstrapped():
     """The value after a time limit is of the state before the reset; with limit_ends it is 0."""
     for limit_ends in (False, True):
         opt = small_options(horizon=14, limit_ends=limit_ends)
-        trainer = ppo.Trainer(opt, ppo.make_env(opt))
+        trainer = ppo.Trainer(opt, *ppo.make_envs(opt))
         trainer.start()
         finals, step = [], trainer.env.step
 

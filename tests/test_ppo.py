@@ -39,8 +39,7 @@ def tiny(**changes):
 
 def trainer_of(char, ref, episode=500, **changes):
     opt = tiny(episode=episode, **changes)
-    env = Env(char, ref, opt.envs, opt.seed, 1, episode, asymmetric="asymmetric" not in opt.without)
-    trainer = Trainer(opt, env)
+    trainer = Trainer(opt, *ppo.environments(char, ref, opt))
     trainer.start()
     return trainer
 
@@ -486,20 +485,58 @@ def test_resume_is_exact(whole, tmp_path):
 
 
 def test_second_thread_changes_nothing(char, ref):
-    """Actor and critic learn the same side by side as one after the other, and nothing else has changed meanwhile."""
+    """Both halves are simulated, and actor and critic learn, the same side by side as one after the other."""
     one, two = (trainer_of(char, ref, envs=128, horizon=40, minibatch=1024, threads=n) for n in (1, 2))
-    assert two.two and not one.two
+    assert two.two and not one.two and [e.n for e in two.envs] == [64, 64]
     for t in (one, two):
         before = t.policy.critic.theta.copy(), t.policy.norm.count
         for _ in range(2):
-            t.collect()
+            stats = t.collect()
             losses = t.update()
         assert not np.array_equal(t.policy.critic.theta, before[0]) and np.isfinite(losses["value_loss"])
         assert t.policy.norm.count == before[1] + 2 * 40 * 128
+        assert stats["end_far"] + stats["end_fall"] == t.terminated.sum() > 0
     for name, value in one.policy.arrays().items():
         np.testing.assert_array_equal(value, two.policy.arrays()[name], err_msg=name)
+    for name in ("raw", "action", "reward", "next_value", "truncated"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name), err_msg=name)
     with pytest.raises(ZeroDivisionError):
         ppo.aside(lambda: 1 / 0)()
+
+
+def test_halves(char, ref):
+    """From `ppo.HALVES` characters on there are two environments; each one's samples are what it does alone."""
+    t = trainer_of(char, ref, envs=65, horizon=12, threads=2, episode=5)
+    assert [e.n for e in t.envs] == [33, 32] and t.x.shape[:2] == (12, 65) and t.full.shape == (65, t.env.critic_size)
+    assert len(ppo.environments(char, ref, tiny(envs=65, norm_each_step=True))) == 1
+    assert [e.n for e in ppo.environments(char, ref, tiny(envs=63))] == [63]
+    stats, value = t.collect(), lambda full: t.policy.value(t.policy.norm.normalise(full))
+    terms = dict.fromkeys(TERMS, 0.0)
+    for k, rows in enumerate((slice(0, 33), slice(33, 65))):
+        twin = Env(char, ref, t.envs[k].n, threads=1, horizon=5)
+        twin.reset([t.opt.seed, k] if k else t.opt.seed)
+        for step in range(12):
+            np.testing.assert_array_equal(t.raw[step, rows], twin.full)
+            _, reward, terminated, truncated, info = twin.step(t.action[step, rows])
+            np.testing.assert_array_equal(t.reward[step, rows], reward)
+            after = value(np.where(truncated[:, None], info.get("final_critic", twin.full), twin.full))
+            expected = np.where(terminated, 0.0, after)
+            np.testing.assert_allclose(t.next_value[step, rows], expected, rtol=1e-4, atol=1e-4)
+            for name in terms:
+                terms[name] += info["terms"][name].sum() / (12 * 65)
+        assert truncated.sum() + t.truncated[:, rows].sum() > 20
+    for name, mean in terms.items():
+        assert stats[f"r_{name}"] == pytest.approx(mean, rel=1e-9, abs=1e-12)
+    assert not np.array_equal(t.action[0, :32], t.action[0, 33:])  # each explores by itself
+
+
+def test_resume_of_halves_is_exact(tmp_path):
+    """Two environments, which two threads simulate before the stop and one after it."""
+    many = ("--envs", "64", "--minibatch", "256")
+    train(tmp_path / "whole", 2 * 8, *many)
+    train(tmp_path / "a", 8, *many, "--threads", "2")
+    train(tmp_path / "a", 2 * 8, "--resume", "--threads", "1")
+    assert_same_run(tmp_path / "whole", tmp_path / "a")
 
 
 def test_resume_is_exact_when_disturbed(tmp_path):
@@ -511,20 +548,20 @@ def test_resume_is_exact_when_disturbed(tmp_path):
     assert_same_run(tmp_path / "whole", tmp_path / "a")
 
 
-def test_make_env_augments(ref):
+def test_make_envs_augments(ref):
     opt = Options(clips="*stand*", envs=5, horizon=4, threads=1, episode=77)
-    plain, again = ppo.make_env(opt), ppo.make_env(replace(opt, out="elsewhere"))
+    [plain], [again] = ppo.make_envs(opt), ppo.make_envs(replace(opt, out="elsewhere"))
     assert plain.n == 5 and plain.horizon == 77 and plain.ref.names == ["stand_007"]
     assert ppo.fingerprint(plain.ref) == ppo.fingerprint(again.ref)
     assert plain.disturbance == Disturbance()  # nothing is added unless asked for
     more = replace(opt, augment=True, sensor_offset=0.02, sensor_noise=0.01, push=0.3)
-    env = ppo.make_env(more)
+    [env] = ppo.make_envs(more)
     frames = len(plain.ref)
     assert len(env.ref.names) == 2 and "mirrored" in env.ref.names[1]
     np.testing.assert_array_equal(env.ref.qpos[:frames], plain.ref.qpos)
     assert env.disturbance == Disturbance(sensor_offset=0.02, sensor_noise=0.01, push=0.3)
-    assert ppo.fingerprint(env.ref) == ppo.fingerprint(ppo.make_env(more).ref) != ppo.fingerprint(plain.ref)
-    assert ppo.fingerprint(env.ref) != ppo.fingerprint(ppo.make_env(replace(more, seed=1)).ref)
+    assert ppo.fingerprint(env.ref) == ppo.fingerprint(ppo.make_envs(more)[0].ref) != ppo.fingerprint(plain.ref)
+    assert ppo.fingerprint(env.ref) != ppo.fingerprint(ppo.make_envs(replace(more, seed=1))[0].ref)
 
 
 def test_resume_from_a_damaged_checkpoint(whole, tmp_path, capsys):
@@ -617,7 +654,7 @@ def test_resume_refuses_a_foreign_checkpoint(whole, tmp_path):
     train(tmp_path / "a", 1)
     arrays, meta = load_checkpoint(whole / CHECKPOINT)
     path = tmp_path / "a" / CHECKPOINT
-    for change in ({k: v for k, v in arrays.items() if "adam" not in k}, arrays | {"env.frame": np.zeros(3, int)}):
+    for change in ({k: v for k, v in arrays.items() if "adam" not in k}, arrays | {"env0.frame": np.zeros(3, int)}):
         save_checkpoint(path, change, meta)
         path.with_suffix(".prev.npz").unlink()  # a damaged one would be replaced by the one before
         with pytest.raises(UserError, match="does not fit|no array"):
@@ -708,12 +745,12 @@ def test_init_headset_only(whole, tmp_path, char):
 def test_switches_reach_the_environment():
     """Each flag, and the variant of the character, in the environment that is trained."""
     opt = Options(clips="*stand*", envs=3, threads=1)
-    plain = ppo.make_env(opt)
-    env = ppo.make_env(replace(opt, without=("contact", "action", "asymmetric"), sensors="hmd", scale=0.9))
+    [plain] = ppo.make_envs(opt)
+    [env] = ppo.make_envs(replace(opt, without=("contact", "action", "asymmetric"), sensors="hmd", scale=0.9))
     assert {t for t in TERMS if env.char.reward[t][0] == 0} == {"contact", "action_diff", "action_min"}
     assert (env.devices, env.asymmetric, env.char.variant) == (1, False, {"scale": 0.9})
     assert (plain.devices, plain.asymmetric, plain.char.variant) == (3, True, {})
-    env = ppo.make_env(replace(opt, track="root"))
+    [env] = ppo.make_envs(replace(opt, track="root"))
     assert env.char.reward["q"][0] == 0 < env.char.reward["x"][0] and env.ref.link_pos.shape[1] == 1
     for wrong in (["--without", "contact,gravity"], ["--track", "head"], ["--sensors", "none"]):
         with pytest.raises(SystemExit):
