@@ -461,9 +461,10 @@ class _Loader:
         driven = [j.name for j in tail if j.name in motors]
         if not tail:
             self.fail(f"--tail {how}: no hinge of {self.xml.name} is called tail…")
-        if how not in TAILS or (how == "active" and not driven):
-            valid = ", ".join(TAILS if driven else TAILS[1:])
-            self.fail(f"--tail {how}: no hinge of its tail has a motor; valid: {valid}")
+        if not driven and how != "fixed":
+            self.fail(f"--tail {how}: no hinge of its tail has a motor, it is passive as it is; valid: fixed")
+        if how not in TAILS:
+            self.fail(f"--tail {how}: valid: {', '.join(TAILS)}")
         if how == "passive":
             self.released = driven
             for name in driven:

@@ -1036,8 +1036,8 @@ def main(argv=None):
     of_gym = any(a.split("=")[0] == "--gym" for a in argv)
     opt = cli(with_defaults_of_cleanrl(Options) if of_gym else Options, argv, "ppo.py", __doc__)
     opt = replace(opt, out=opt.out or f"runs/{Path(opt.gym or opt.character).stem}")
-    if not opt.ship and (opt.blend or opt.gain != 1.0):
-        raise UserError("--blend and --gain are of --ship FILE.npz: give it, or leave them out")
+    if not opt.ship and (opt.blend or opt.gain != 1.0 or opt.share != 0.5):
+        raise UserError("--blend, --share and --gain are of --ship FILE.npz: give it, or leave them out")
     if opt.ship:
         meta = ship(opt.out, opt.ship, opt.blend, opt.share, opt.gain)
         print(f"{opt.ship}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}; {meta['licence']}")

@@ -930,7 +930,7 @@ def test_blended(tmp_path):
         ppo.ship(paths[1], tmp_path / "c.npz", [tmp_path / "odd.npz"])
     save_checkpoint(tmp_path / "less.npz", arrays, meta | {"options": meta["options"] | {"set": "reward.q=[0, 1]"}})
     ppo.ship(paths[1], tmp_path / "d.npz", [tmp_path / "less.npz"])  # another reward is the same body
-    with pytest.raises(UserError, match="--blend and --gain are of --ship"):
+    with pytest.raises(UserError, match="--blend, --share and --gain are of --ship"):
         ppo.main(["--blend", str(paths[0]), "--out", str(tmp_path / "never")])
     assert not (tmp_path / "c.npz").exists() and not (tmp_path / "never").exists()
 
