@@ -83,7 +83,7 @@ class HeadingFrame:
 def observe_user(frame: HeadingFrame, pos, rot, out):
     r"""Sensor part of the observation  [Reda23 Eq. 4]: o_user = [h, l, r, R_h, R_l, R_r]; [h, R_h] of a headset alone.
 
-    Args      pos (N, d, 3) [m], rot (N, d, 3, 2) first two columns of the rotations, world, mapped by the root scale,
+    Args      pos (N, d, 3) [m], rot (N, d, 3, 2) first two columns of the rotations, world, mapped by the sensor scale,
               of d = 3 devices or 1; out (N, 9 d)
     Test      tests/test_env.py::test_observation_terms, test_headset_only
     """

@@ -2,8 +2,9 @@ r"""Metrics: one definition each, for every table  [Reda23 §4; it prints none].
 
     Recording ──► measure ──► key -> number ──► table, comparison, as_json
 
-Targets and labels are the human's for every row, before any scaling; a failure ends a recording, and `completed` and
-`survival` say how much of the motion the other numbers are about.
+Contact labels and the human's own figures are taken before any scaling, targets are what the policy is to reach: the
+scaled root, the mapped devices, the kinematic pose.  A failure ends a recording, and `completed` and `survival` say how
+much of the motion the other numbers are about.
 """
 
 from __future__ import annotations
@@ -51,22 +52,30 @@ def jitter(x, rate):
 
 
 def footfalls(contact):
-    """How often a foot begins to touch, each beginning counted: spec/metrics.  contact (T, 2) bool -> int"""
+    """How often a foot begins to touch, each beginning counted: spec/metrics.  contact (T, 2) bool -> int
+
+    Test      tests/test_metrics.py::test_steps_contacts_and_torques"""
     return mocap.footfalls(contact, 1.0, apart=0.0)
 
 
 def travelled(root):
-    """Length of the root's path on the floor [m].  (T, 3) -> float"""
+    """Length of the root's path on the floor [m].  (T, 3) -> float
+
+    Test      tests/test_metrics.py::test_metrics_on_known_motion"""
     return float(np.linalg.norm(np.diff(root[:, :2], axis=0), axis=-1).sum())
 
 
 def local_rotations(quat, parents):
-    """Rotation of each body in its parent.  quat (T, b, 4), parents (b,) -> (T, b, 4)"""
+    """Rotation of each body in its parent.  quat (T, b, 4), parents (b,) -> (T, b, 4)
+
+    Test      tests/test_metrics.py::test_metrics_against_slow_loop"""
     return quat_mul(quat_conj(quat[:, parents]), quat)
 
 
 def head_rates(quat, rate):
-    """Roll and yaw velocity of the head about its own axes.  (T, 4) -> (T, 2) [rad/s]"""
+    """Roll and yaw velocity of the head about its own axes.  (T, 4) -> (T, 2) [rad/s]
+
+    Test      tests/test_metrics.py::test_metrics_on_known_motion"""
     return quat_rotate(quat_conj(quat), mocap.angular_velocity(quat, rate))[:, [0, 2]]
 
 

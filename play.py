@@ -284,7 +284,9 @@ def simulate(
 
 
 def kinematic(char: Character, ref: Reference, horizon=EPISODE_STEPS) -> list[Recording]:
-    """The retargeted pose itself, as if it were a character; its contact is height < 2 cm and speed < 0.4 m/s."""
+    """The retargeted pose itself, as if it were a character; its contact is height < 2 cm and speed < 0.4 m/s.
+
+    Test      tests/test_metrics.py::test_metrics_of_kinematic"""
     out = []
     for a, b in zip(ref.first, ref.last, strict=True):
         frames = np.arange(a, min(b, a + horizon) + 1)

@@ -129,14 +129,14 @@ def sole_points(char: Character, xpos, xmat):
 # ------------------------------------------------------------------------------------ human pose -> character pose
 
 
-def root_scale(char: Character, clip: Clip) -> np.ndarray:
-    """Scale (s_xy, s_xy, s_z) of root and sensor positions  [Reda23 §3.4].
+def root_scale(char: Character, hip_height: float) -> np.ndarray:
+    """Scale (s_xy, s_xy, s_z) of the root's position  [Reda23 §3.4], of a user with hips so high [m].
 
     ASSUMED   travel is not scaled (Fig. 5), height is scaled by the ratio of hip heights.
     Test      tests/test_retarget.py::test_root_scale
     """
     xy, z = char.spec["root"].get("scale_xy", 1.0), char.spec["root"].get("scale_z", "hip")
-    z = char.hip_height / clip.hip_height if z == "hip" else z
+    z = char.hip_height / hip_height if z == "hip" else z
     return np.array([xy, xy, z])
 
 
@@ -165,19 +165,20 @@ def standing(char: Character, offset, pos, quat) -> np.ndarray:
     return np.concatenate([place[:, :2], height, root, pose], axis=1)
 
 
-def sensor_scale(char: Character, clip: Clip) -> np.ndarray:
+def sensor_scale(char: Character, hip_height: float, headset_height: float) -> np.ndarray:
     r"""Scale (s_xy, s_xy, s_z) of headset and controller positions  [Reda23 §3.4].
 
     Equation  s_z = the character's headset height / the user's, both standing upright
-    ASSUMED   the paper has no map for them.  A headset sees no hips: this is what a real user can be measured by
-              (`stream.calibrate` does the same), and a user of any build then wears the headset at the character's
-              head.  With `[sensors] scale_z = "hip"` they go through `root_scale`: a CMU subject's headset is then 11
-              to 20 cm above Jesse's head, Oppy's user's 25 cm below Oppy's eyes
-    Test      tests/test_retarget.py::test_sensor_scale
+    ASSUMED   the paper sends them through the root's map; ours is another.  A headset sees no hips: this is what a real
+              user can be measured by, and a user of any build then wears the headset at the character's head.  With
+              `[sensors] scale_z = "hip"` they go through `root_scale`: a CMU subject's headset is then 11 to 20 cm
+              above Jesse's head, Oppy's user's 25 cm below Oppy's eyes
+    Args      hip_height, headset_height : of the user [m]; of a clip's, or of a stream's (`stream.calibrate`)
+    Test      tests/test_retarget.py::test_sensor_scale, tests/test_stream.py::test_calibration_scales_as_training
     """
-    scale, z = root_scale(char, clip), char.spec["sensors"].get("scale_z", "headset")
+    scale, z = root_scale(char, hip_height), char.spec["sensors"].get("scale_z", "headset")
     if z != "hip":
-        scale[2] = headset(char)[2] / mocap.headset_height(clip) if z == "headset" else z
+        scale[2] = headset(char)[2] / headset_height if z == "headset" else z
     return scale
 
 
@@ -247,7 +248,7 @@ def retarget(char: Character, clip: Clip) -> Pose:
         chains[a, b] = quat_mul(done, quat_mul(local, quat_conj(char.rest[body])))
         q[:, hinges] = angles * sign
     inside = np.clip(q, char.ranges[:, 0], char.ranges[:, 1])
-    root_pos = clip.pos[:, 0] * root_scale(char, clip)
+    root_pos = clip.pos[:, 0] * root_scale(char, clip.hip_height)
     root_quat = quat_continuous(quat_mul(clip.quat[:, 0], char.rest[char.root]))
     qpos = np.concatenate([root_pos, root_quat, inside], axis=1)
     spin = quat_rotate(quat_conj(root_quat), angular_velocity(root_quat, clip.rate))
@@ -318,7 +319,8 @@ def reference(char: Character, clips: list[Clip]) -> Reference:
 def _reference_of(char, clip):
     pose = retarget(char, clip)
     fk = forward_kinematics(char, pose.qpos, pose.qvel)
-    scale, size = root_scale(char, clip), sensor_scale(char, clip)
+    scale = root_scale(char, clip.hip_height)
+    size = sensor_scale(char, clip.hip_height, mocap.headset_height(clip))
     sensor_pos, sensor_quat = mocap.sensors(clip)
     f32 = np.float32
     return dict(

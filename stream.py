@@ -33,7 +33,7 @@ import numpy as np
 from character import Character, geom_lowest
 from env import BAD, SUBSTEPS, fallen, observation_terms, observe, slices_of
 from mocap import CONTROL_RATE, heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate, quat_slerp
-from retarget import STAGE_VEL, Reference, headset, standing
+from retarget import STAGE_VEL, Reference, headset, sensor_scale, standing
 from runs import UserError, kind_of, parse_number
 
 DEVICES = ("head", "left", "right")
@@ -575,6 +575,7 @@ class Resampler:
 CALIBRATION, SEEN = 1.0, 1000  # s of headset; readings kept of it: of a faster stream every other one
 STANDING = (1.0, 1.9)  # m, where the headset of a standing user may be; otherwise the floor is not at height 0
 AVERAGE = 1.64  # m, headset of a user of 1.75 m, taken where the floor is not known.  ASSUMED
+HIPS = 0.554  # of that height: the hips, which a headset does not see, for `scale_z = "hip"`.  ASSUMED
 
 
 @dataclass(frozen=True)
@@ -601,13 +602,14 @@ def calibrate(char: Character, pos, quat, user_height: float | None = None) -> C
     r"""User's size, floor and forward direction from a second of headset poses.
 
     Height    the 87.5th percentile of the headset's height (the median of its upper quarter: people stoop, nobody
-              stretches) is a standing user's; s_z = the character's headset height / the user's, s_xy as in the TOML
+              stretches) is a standing user's
+    Scale     `retarget.sensor_scale`, as in training
     Floor     at height 0 of the stream if that makes the user's headset 1.0 to 1.9 m high; otherwise 1.64 m below it;
               with user_height, that much below it
     Forward   the mean heading; the place: the median
-    ASSUMED   all three; the paper does not say how a real user is measured
+    ASSUMED   all but the scale; the paper does not say how a real user is measured
     Args      pos (T, 3), quat (T, 4) of the headset, `to_world`'s axes
-    Test      tests/test_stream.py::test_calibration
+    Test      tests/test_stream.py::test_calibration, test_calibration_scales_as_training
     """
     top = float(np.percentile(pos[:, 2], 87.5))
     estimated = user_height is not None or not STANDING[0] <= top <= STANDING[1]
@@ -615,8 +617,8 @@ def calibrate(char: Character, pos, quat, user_height: float | None = None) -> C
     yaw = heading(quat)
     yaw = float(np.arctan2(np.sin(yaw).mean(), np.cos(yaw).mean()))
     origin = np.array([*np.median(pos[:, :2], axis=0), top - height])
-    xy = char.spec["root"].get("scale_xy", 1.0)
-    return Calibration(height, top - height, estimated, yaw, origin, np.array([xy, xy, headset(char)[2] / height]))
+    scale = sensor_scale(char, HIPS * height, height)
+    return Calibration(height, top - height, estimated, yaw, origin, scale)
 
 
 class Stream:

@@ -135,6 +135,35 @@ def test_springs_hold_the_default_pose(chars, name):
     np.testing.assert_array_equal(c.model.qpos_spring[7:][rest], c.default[rest])
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_parts_are_what_they_are_called(chars, name):
+    """Armature; links, sites, limbs, and what may touch the floor; left is left, of hands and of contact sensors."""
+    c = chars[name]
+    m, d, armature = c.model, mujoco.MjData(c.model), c.spec["passive"]["armature"]
+    bodies = lambda ids: [m.body(b).name for b in ids]  # noqa: E731
+    kinds = lambda names: {n.split("_")[0].rstrip("0123456789") for n in names}  # noqa: E731
+    for h in c.driven:
+        group = character.joint_group(c.hinges[h])
+        assert m.dof_armature[6 + h] == armature.get(group, armature.get(character.numberless(group))), c.hinges[h]
+    assert bodies(c.obs_links) == ["pelvis", "spine3", "head", "hand_l", "hand_r", "foot_l", "foot_r"]
+    assert bodies(m.site_bodyid[c.sensor_sites]) == ["head", "hand_l", "hand_r"]
+    assert set(bodies(metrics.sip_bodies(c))) == {f"{part}_{s}" for part in ("upper_arm", "thigh") for s in "lr"}
+    fall = set(bodies(m.geom_bodyid[c.fall_geoms]))
+    others = set(bodies(b for b, a in zip(m.geom_bodyid, m.geom_conaffinity, strict=True) if a and b)) - fall
+    low = {"thigh", "shin", "foot", "tail", "ear"}
+    assert kinds(others) <= low and not kinds(fall) & low
+    for foot, lean in enumerate((-0.15, 0.15)):  # to the left, to the right: that foot alone is on the floor
+        mujoco.mj_resetData(m, d)
+        d.qpos[2], d.qpos[7:] = c.hip_height, c.default
+        d.qpos[3:7] = Rotation.from_rotvec([lean, 0, 0]).as_quat(scalar_first=True)
+        mujoco.mj_kinematics(m, d)
+        d.qpos[2] -= retarget.geom_lowest(m, c.sole_geoms[foot], d.geom_xpos[None], d.geom_xmat[None]).min() + 2e-3
+        mujoco.mj_forward(m, d)
+        assert list(np.abs(d.sensordata[c.contact_adr]) > 1.0) == [foot == 0, foot == 1]
+        _, left, right = d.site_xpos[c.sensor_sites]
+        assert left[1] > right[1] + 0.1
+
+
 def test_hold_names_driven_joints():
     with pytest.raises(UserError, match=r"\[passive\] hold = \['wing'\] must list driven joints; there are .*tail0"):
         character.load("dino", set=("passive.hold=['wing']",))

@@ -86,7 +86,7 @@ def rotation(quat):
 def slow_observation(env, i):
     """Eqs. 2 to 4 and the critic's part for one environment, written from the paper."""
     d, ref, f, m = fresh(env, i), env.ref, env.frame[i], env.char.model
-    end = max(b for a, b in zip(ref.first, ref.last, strict=True) if a <= f <= b)
+    start, end = next((a, b) for a, b in zip(ref.first, ref.last, strict=True) if a <= f <= b)
     left = d.xmat[env.char.root].reshape(3, 3)[:, 1]  # the body's left axis, laid on the floor
     to_heading = Rotation.from_euler("z", math.atan2(-left[0], left[1])).inv().as_matrix()
     origin = np.array([d.qpos[0], d.qpos[1], 0.0])
@@ -108,7 +108,7 @@ def slow_observation(env, i):
         "qd": np.concatenate([to_heading @ d.qvel[:3], to_heading @ spin, d.qvel[6:]]),
         "x": np.concatenate([point(d.xpos[b]) for b in links]),
         "R": np.concatenate([six(d.xmat[b].reshape(3, 3)) for b in links]),
-        "user_previous": user(max(f - 1, 0)),  # in the frame of time t
+        "user_previous": user(max(f - 1, start)),  # in the frame of time t
         "user": user(f),
         "human_pos": np.concatenate([point(p) for p in ref.human_pos[f]]),
         "human_rot": np.concatenate([(to_heading @ r).ravel() for r in ref.human_rot[f]]),
@@ -121,7 +121,7 @@ def slow_observation(env, i):
 def test_observation_terms(shared, ref, rng):
     """Every term of every environment, after some steps and after a reset, in order; also near a sequence's end."""
     env = Env(shared, ref, N, horizon=500)
-    ends = np.array([ref.last[0] - 8, ref.last[1] - 7, ref.first[2] + 3, 40, 41, 42, 200, 0])
+    ends = np.array([ref.last[0] - 8, ref.last[1] - 7, ref.first[2] + 3, 40, 41, ref.first[1], 200, 0])
     env.reset(3, frames=ends)
     for steps in (0, 5):
         if steps:
@@ -457,6 +457,9 @@ def test_contact_forces(ref, rng):
     np.testing.assert_allclose(normal.sum(axis=1), weight, rtol=0.02)
     for foot, name in enumerate(("contact_l", "contact_r")):
         assert statue.contact_adr[foot] == m.sensor(name).adr[0] + 2  # x, y, z: the third
+    env.sensordata = np.zeros((1, m.nsensordata))
+    env.sensordata[:, statue.contact_adr] = [0.9, 1.1]
+    assert env._contact().tolist() == [[False, True]]  # 1 N
 
 
 def test_contact_is_that_of_the_last_substep(shared, ref, rng):
@@ -610,6 +613,45 @@ def test_termination(shared, ref):
     assert list(info["ends"]["time"]) == [True] * 4 + [False, False]
     assert list(info["ends"]["clip"]) == [False] * 5 + [True] and not terminated.any()
     np.testing.assert_allclose(reward, sum(info["terms"].values()), atol=1e-12)
+
+
+def test_step_rewards_what_was_done(char, ref, rng):
+    """What `step` gives the terms and the limits: this frame's targets, the contact of this step's forces, the clipped
+    action and the one before it."""
+    env = Env(char, ref, 32, autoreset=False)
+    env.reset(5)
+    ended = 0
+    for _ in range(25):
+        before, seen, contact = env.action.copy(), [], env._contact
+        env._contact = lambda seen=seen, contact=contact: seen.append(contact()) or seen[-1]
+        a = rng.normal(0.0, 0.7, (32, 33))  # some beyond ±1
+        info, env._contact = env.step(a)[4], contact
+        f, clipped, ends = env.frame, np.clip(a, -1, 1), info["ends"]
+        distances = dict(
+            action_diff=np.mean((clipped - before) ** 2, axis=1),
+            action_min=np.mean(clipped**2, axis=1),
+            contact=np.sqrt(np.sum(seen[0] != ref.contact[f], axis=1)),
+        )
+        for name, d in distances.items():
+            w, k = char.reward[name]
+            np.testing.assert_allclose(info["terms"][name], w * np.exp(-k * d), rtol=1e-9, err_msg=name)
+        far = np.linalg.norm(env.qpos[:, :3] - ref.qpos[f, :3], axis=1) > 0.30
+        np.testing.assert_array_equal(ends["far"], far & ~ends["fall"])
+        ended += (ends["far"] | ends["fall"]).sum()
+    assert ended > 10
+
+
+def test_any_upper_body_shape_falls(shared, ref):
+    """Not the head alone: limp characters fall on hands and hips first."""
+    env = Env(shared, ref, 32, autoreset=False, horizon=10**6)
+    env.reset(0)
+    early = 0
+    for _ in range(60):
+        fell = env.step(np.zeros((32, 33)))[4]["ends"]["fall"]
+        low = retarget.geom_lowest(shared.model, shared.fall_geoms, env.geom_xpos, env.geom_xmat).min(1)
+        np.testing.assert_array_equal(fell, low <= 0)
+        early += np.sum(fell & (env.xpos[:, shared.head, 2] > 0.2))
+    assert early > 10
 
 
 def test_fall_is_contact(shared, ref):

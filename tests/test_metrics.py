@@ -6,6 +6,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from test_mocap import walk
 
 import character
 import metrics
@@ -254,6 +255,23 @@ def test_metrics_on_known_motion(char, ref):
     row = changed(sink)
     assert row["penetration_mm"] == pytest.approx(5.0, abs=1e-6)  # over the ten frames below only
     assert nothing["penetration_mm"] == pytest.approx(max(0.0, -1000 * lowest), abs=1e-6)
+
+
+def test_human_is_measured_before_the_scaling():
+    clip, rows = walk(3.0), []
+    for change in ((), ("root.scale_xy=0.5",)):
+        c = character.load("jesse", set=change)
+        r = retarget.reference(c, [clip])
+        rows.append(metrics.measure(c, r, play.kinematic(c, r)))
+    for key in ("human_steps_per_m", "human_jitter_m_s3"):
+        assert rows[0][key] == pytest.approx(rows[1][key], rel=1e-3), key
+
+
+def test_head_is_compared_with_the_humans(char, ref):
+    still_ref, rec = still(char, ref)
+    nods = mocap.quat_mul(mocap.quat_about(1, 0.2), still_ref.orientation)  # the human does, the kinematic pose not
+    row = metrics.measure(char, replace(still_ref, orientation=nods), [rec])
+    assert row["head_deg"] == pytest.approx(np.degrees(0.2))
 
 
 def test_steps_contacts_and_torques(char, ref):

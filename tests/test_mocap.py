@@ -975,6 +975,31 @@ def test_restyle():
     assert_same(mocap.restyle(clip, np.random.default_rng(1), (1.0, 1.0), 0.0), clip)
 
 
+def test_restyle_turns_both_arms_alike():
+    """The right arm is turned as the left one in the mirror."""
+    clip, turns = walk(2.0, seed=8), {"l": [], "r": []}
+
+    def local(c, name):
+        q = mocap.quat_mul(mocap.quat_conj(c.quat[0, SEG["chest"]]), c.quat[0, SEG[name]])
+        return Rotation.from_quat(q, scalar_first=True)
+
+    for seed in range(30):
+        other = mocap.restyle(clip, np.random.default_rng(seed), (1.0, 1.0))
+        for side, out in turns.items():
+            arm = f"upper_arm_{side}"
+            out.append((local(other, arm) * local(clip, arm).inv()).as_rotvec())
+    left, right = (np.array(v) for v in turns.values())
+    x, y, z = (np.corrcoef(left[:, a], right[:, a])[0, 1] for a in range(3))
+    assert x < -0.8 and y > 0.8 and z < -0.8
+
+
+def test_hip_height_of_a_noisy_frame():
+    clip = walk(8.0)
+    pos = clip.pos.copy()
+    pos[100, :, 2] -= 0.1
+    assert replace(clip, pos=pos).hip_height == pytest.approx(clip.hip_height, abs=2e-3)
+
+
 def test_fastest_second():
     """By hand: 1 m/s but for a second at 3 m/s; of half a second the mean; of a single frame nothing."""
     rest = still(121)

@@ -324,6 +324,66 @@ def test_non_finite_state_does_not_reach_the_networks(char, ref, tmp_path, monke
     t.collect(), t.update()
 
 
+def test_what_an_update_is_made_of(char, ref, monkeypatch):
+    """Advantages end with the episodes and are standardised; samples are drawn anew in each epoch; KL(old ‖ new)."""
+    t, seen = trainer_of(char, ref, episode=3, epochs=2, target_kl=10.0), {}
+    t.collect()
+    assert t.truncated.any()
+
+    def spy(name, f):
+        def spied(*a):
+            seen.setdefault(name, []).append([v.copy() if isinstance(v, np.ndarray) else v for v in a])
+            return f(*a)
+
+        return spied
+
+    for name in ("gae", "policy_loss", "gaussian_kl"):
+        monkeypatch.setattr(ppo, name, spy(name, getattr(ppo, name)))
+    old, batches = t.policy.log_std.copy(), t.reward.size // t.opt.minibatch
+    t.update()
+    [(_, _, _, done, gamma, lam)] = seen["gae"]
+    np.testing.assert_array_equal(done, t.terminated | t.truncated)
+    assert (gamma, lam) == (t.opt.gamma, t.opt.lam)
+    given = [np.concatenate([call[k] for call in seen["policy_loss"]]) for k in (2, 4)]
+    (first, second), (advantage, _) = (np.split(v, 2) for v in given)
+    assert abs(advantage.mean()) < 1e-5 and abs(advantage.std() - 1) < 1e-4
+    flat = t.action.reshape(-1, t.env.action_size)
+    assert (first != flat).any() and (first != second).any()
+    np.testing.assert_array_equal(np.sort(first, axis=0), np.sort(flat, axis=0))
+    assert len(seen["gaussian_kl"]) == 2 * batches and any((std != old).any() for *_, std in seen["gaussian_kl"])
+    for _, std, *_ in seen["gaussian_kl"]:
+        np.testing.assert_array_equal(std, old)
+
+
+def test_epochs_and_rate_follow_kl(char, ref):
+    """Beyond twice the target the epoch is the last; within 1.3 of it the rate stays as it is."""
+    kl = {}
+    for lr in (1e-2, 2e-3):
+        once = trainer_of(char, ref, epochs=1, lr=lr)
+        once.collect()
+        kl[lr] = once.update()["kl"]
+    for target, epochs in ((kl[1e-2] / 3, 1), (kl[1e-2], 2)):
+        t = trainer_of(char, ref, epochs=2, lr=1e-2, target_kl=target)
+        t.collect(), t.update()
+        assert t.adam_pi.t == epochs * 3
+    t = trainer_of(char, ref, epochs=1, lr=2e-3, target_kl=kl[2e-3])
+    t.collect(), t.update()
+    assert t.adam_pi.lr == 2e-3
+
+
+def test_play_clips_observations_as_training(char, ref):
+    t = trainer_of(char, ref)
+    far = t.env.full + 100.0
+    want = t.policy.actor(t.policy.norm.normalise(far)[:, : t.env.obs_size])
+    np.testing.assert_allclose(t.policy.mean_action(far[:, : t.env.obs_size]), want, rtol=1e-5, atol=1e-6)
+
+
+def test_time_to_failure(char, ref):
+    t = trainer_of(char, ref, envs=32, horizon=30)
+    stats = t.collect()
+    assert t.terminated.any() and stats["time_to_failure"] == pytest.approx(32 * 30 / 30 / t.terminated.sum())
+
+
 def test_update_improves_both_losses(char, ref):
     t = trainer_of(char, ref, envs=16, horizon=16, minibatch=64, epochs=5)
     t.collect()

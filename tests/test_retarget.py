@@ -21,6 +21,11 @@ ALL_THREE = ("chest", "head", "upper_arm_l", "upper_arm_r", "thigh_l", "thigh_r"
 BODY_OF = {"chest": "spine3"}  # Jesse's body of a segment, where the names differ
 
 
+def sizes(clip):
+    """Of the human: hip and headset height [m]."""
+    return clip.hip_height, mocap.headset_height(clip)
+
+
 def clip_of(kind, seconds=6.0, seed=0, **params) -> Clip:
     m = gait.generate(kind, seconds, seed=seed, **params)
     return Clip(f"{kind}_{seed}", kind, m["rate"], m["pos"], m["quat"], m["ball"])
@@ -393,14 +398,17 @@ def test_sensor_scale(char, mini):
             if SEGMENTS[i] in ("chest", "head"):
                 pos[:, i] = pos[:, parent] + [0.0, 0.0, clip.limb(SEGMENTS[parent], SEGMENTS[i])]
         upright = dataclasses.replace(clip, pos=pos, quat=q)
-        top = mocap.sensors(upright)[0][0, 0, 2] * retarget.sensor_scale(char, clip)
+        top = mocap.sensors(upright)[0][0, 0, 2] * retarget.sensor_scale(char, *sizes(clip))
         d = posed(char.model, np.concatenate([[0, 0, char.hip_height], char.rest[char.root], char.default]))
         np.testing.assert_allclose(top[2], d.site_xpos[char.sensor_sites[0], 2], rtol=1e-6)
         np.testing.assert_array_equal(top[:2] > 0, True)
     with_hip = character.load("jesse", set=('sensors.scale_z="hip"',))
-    np.testing.assert_array_equal(retarget.sensor_scale(with_hip, clip), retarget.root_scale(char, clip))
+    np.testing.assert_array_equal(
+        retarget.sensor_scale(with_hip, *sizes(clip)),
+        retarget.root_scale(char, clip.hip_height),
+    )
     fixed = character.load("jesse", set=("sensors.scale_z=0.7",))
-    np.testing.assert_allclose(retarget.sensor_scale(fixed, clip), [1, 1, 0.7])
+    np.testing.assert_allclose(retarget.sensor_scale(fixed, *sizes(clip)), [1, 1, 0.7])
     with pytest.raises(UserError, match=r'\[sensors\] scale_z = "?.?eyes.*valid: a number or "hip" or "headset"'):
         character.load("jesse", set=('sensors.scale_z="eyes"',))
 
@@ -410,8 +418,8 @@ def test_root_scale(char, mini):
     clip = clip_of("walk", height=1.6)
     straight = 1.6 * (0.245 + 0.246)  # thigh and shin of a person of 1.6 m
     ankle = np.mean([np.sort(clip.pos[:, SEG[f], 2])[int(0.05 * len(clip))] for f in ("foot_l", "foot_r")])
-    np.testing.assert_allclose(retarget.root_scale(char, clip), [1, 1, 0.9 / (straight + ankle)], rtol=1e-3)
-    np.testing.assert_allclose(retarget.root_scale(mini, clip), [0.5, 0.5, 0.25])
+    np.testing.assert_allclose(retarget.root_scale(char, clip.hip_height), [1, 1, 0.9 / (straight + ankle)], rtol=1e-3)
+    np.testing.assert_allclose(retarget.root_scale(mini, clip.hip_height), [0.5, 0.5, 0.25])
 
 
 def global_error(char, clip, pose, segment):
@@ -438,7 +446,7 @@ def test_retarget_reproduces_segments(char, clips):
         for segment in ("foot_l", "foot_r"):
             error = global_error(char, clip, pose, segment)
             assert np.abs(error[:, :2]).max() < 1e-6 and np.degrees(np.abs(error[:, 2])).mean() < 5
-        np.testing.assert_array_equal(pose.qpos[:, :3], clip.pos[:, 0] * retarget.root_scale(char, clip))
+        np.testing.assert_array_equal(pose.qpos[:, :3], clip.pos[:, 0] * retarget.root_scale(char, clip.hip_height))
         same = np.abs(np.sum(pose.qpos[:, 3:7] * clip.quat[:, 0], axis=1))  # q and -q are one rotation
         np.testing.assert_allclose(same, 1.0, atol=1e-12)
         assert np.all(pose.qpos[:, 7:] >= char.ranges[:, 0]) and np.all(pose.qpos[:, 7:] <= char.ranges[:, 1])
@@ -455,6 +463,17 @@ def test_shares_of_the_spine(char, clips):
     for name, want in (("spine0_y", y / 4), ("spine1_y", y / 4), ("spine2_y", y / 4), ("spine1_x", x / 2),
                        ("spine2_z", z / 2)):  # fmt: skip
         np.testing.assert_allclose(at[name], want, atol=1e-9, err_msg=name)
+
+
+def test_share_and_default_of_a_negative_hinge(tmp_path):
+    """A hinge about −y that takes half of a nod: half of it, negative, on top of its default."""
+    (tmp_path / "mini.xml").write_text(MINI_XML)
+    (tmp_path / "mini.toml").write_text(MINI_TOML.replace('to = "head" }', 'to = "head", y = 0.5 }'))
+    c, clip = character.load(tmp_path / "mini.toml"), clip_of("stand", 1.0)
+    quat = np.tile([1.0, 0, 0, 0], (len(clip), 15, 1))
+    quat[:, SEG["head"]] = mocap.quat_about(1, 0.4)
+    pose = retarget.retarget(c, dataclasses.replace(clip, quat=quat))
+    np.testing.assert_allclose(pose.qpos[:, 7 + c.hinges.index("head_y")], 0.3 - 0.2, atol=1e-12)
 
 
 def test_velocities_of_the_pose(char, clips):
@@ -507,7 +526,7 @@ def test_reference(char, mini, clips):
         part, alone = slice(ref.first[k], ref.last[k] + 1), retarget.reference(char, [clip])
         for field in dataclasses.fields(ref)[4:]:
             np.testing.assert_array_equal(getattr(ref, field.name)[part], getattr(alone, field.name))
-        scale = retarget.root_scale(char, clip)
+        scale = retarget.root_scale(char, clip.hip_height)
         for t in range(0, len(clip), 29):
             f = ref.first[k] + t
             d = posed(char.model, ref.qpos[f], ref.qvel[f])
@@ -518,7 +537,7 @@ def test_reference(char, mini, clips):
                 np.testing.assert_allclose(ref.link_vel[f, i], out[3:], atol=1e-5)
             for i, (s, offset) in enumerate(zip(("head", "hand_l", "hand_r"), mocap.SENSOR_OFFSETS, strict=True)):
                 turn = rotation(clip.quat[t, SEG[s]])
-                where = (clip.pos[t, SEG[s]] + turn.apply(offset)) * retarget.sensor_scale(char, clip)
+                where = (clip.pos[t, SEG[s]] + turn.apply(offset)) * retarget.sensor_scale(char, *sizes(clip))
                 np.testing.assert_allclose(ref.sensor_pos[f, i], where, atol=1e-9)
                 np.testing.assert_allclose(ref.sensor_rot[f, i], turn.as_matrix()[:, :2], atol=1e-6)
                 np.testing.assert_allclose(rotation(ref.sensor_quat[f, i]).as_matrix(), turn.as_matrix(), atol=1e-9)

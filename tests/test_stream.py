@@ -291,6 +291,12 @@ def test_grip():
 # ------------------------------------------------------------------------------------ what can go wrong
 
 
+@pytest.mark.parametrize("axes,grip", [("unity", 15), ("openxr", 90), ("mujoco", 90)])
+def test_grip_by_default(axes, grip):
+    pos, quat = np.zeros((3, 3)), np.tile([0.0, 0, 0, 1], (3, 1))
+    np.testing.assert_allclose(to_world(pos, quat, axes)[1], to_world(pos, quat, axes, grip)[1])
+
+
 def test_unordered_times():
     """Late rows are dropped, equal times stay, missing times follow the rate."""
     clock = Clock(90)
@@ -482,6 +488,19 @@ def test_calibration(jesse):
     assert told.height == 1.7 and told.floor == pytest.approx(2.3 - 1.7, abs=0.01)
 
 
+def test_calibration_scales_as_training(walk):
+    """[root] scale_xy and [sensors] scale_z mean to a stream what they mean to `retarget.sensor_scale`."""
+    hips, top = walk.hip_height, mocap.headset_height(walk)
+    head, turn = np.tile([4.0, -2.0, top], (50, 1)), np.tile([1.0, 0, 0, 0], (50, 1))
+    for change in ("root.scale_xy=0.5", "sensors.scale_z=0.7", 'sensors.scale_z="hip"', 'sensors.scale_z="headset"'):
+        c = character.load("jesse", set=(change,))
+        found, trained = (
+            stream.calibrate(c, head, turn).scale,
+            retarget.sensor_scale(c, hips, top),
+        )
+        np.testing.assert_allclose(found, trained, rtol=0.01, err_msg=change)  # hips are guessed from the headset
+
+
 NO_CALIBRATION = {  # name: (row of the headset, of a good one; what is said of 200 such rows)
     "zero": (lambda row: 0 * row, "200 rows show the headset for 0.00 s; .*; of them 200 all zero"),
     "inf": (lambda row: row + np.inf, "of them 200 not finite"),
@@ -573,6 +592,14 @@ def test_controllers_hang(jesse, walk):
 # ------------------------------------------------------------------------------------ the character
 
 
+def test_hands_hang_where_a_humans_do():
+    """NEUTRAL is where the built-in human's hands are when it stands: the left one on the left."""
+    pos, quat = mocap.sensors(make_walk(4.0, kind="stand", variation=0.0))
+    back = quat_about(2, -mocap.heading(quat[:, 0]))[:, None]
+    hang = quat_rotate(np.tile(back, (1, 3, 1)), pos - pos[:, :1]).mean(0)
+    np.testing.assert_allclose(hang, NEUTRAL, atol=0.15)
+
+
 @pytest.mark.parametrize("devices", [3, 1])
 def test_player_observes_as_env(jesse, walk, devices):
     """From one state, with one user, Player and Env see and do the same for a second."""
@@ -610,6 +637,24 @@ def test_stand(jesse):
     player.before = (pos[None] - [0.01, 0.02, 0.5], None)
     player.stand(pos, np.tile(turn, (3, 1)))
     assert np.allclose(player.qvel[0, :3], [0.3, 0.6, 0.0])
+
+
+def test_away_is_from_the_headset(jesse):
+    player = Player(jesse, lambda obs: np.zeros((1, 33)))
+    pos, quat = np.tile([3.0, -1.0, 1.4], (3, 1)), np.tile([1.0, 0, 0, 0], (3, 1))
+    player.stand(pos, quat)
+    assert player._end(pos - [1.05, 0, 0]) == "away" and player._end(pos + [0.95, 0, 0]) is None
+
+
+def test_errors_are_distances(jesse):
+    """Of the headset, and the mean of both controllers."""
+    player = Player(jesse, lambda obs: np.zeros((1, 33)))
+    pos, quat = np.tile([0.11, 0.0, 1.475], (3, 1)), np.tile([1.0, 0, 0, 0], (3, 1))
+    player.stand(pos, quat)
+    player.before = (pos[None], quat_matrix(quat)[None, ..., :2])
+    sites = player.site_xpos[0, jesse.sensor_sites] + [[0.01, 0, 0], [0, 0.02, 0], [0, 0, 0.06]]
+    player.step(sites, quat)
+    assert player.head_error == pytest.approx(0.01) and player.hand_error == pytest.approx(0.04)
 
 
 def test_falls_are_counted(jesse):
