@@ -45,6 +45,7 @@ import skeletal
 import skeletal_net
 from character import geom_lowest
 from env import BAD, SUBSTEPS, Env
+from metrics import Recording, measure
 from nn import LEAKY_SLOPE, Adam, gaussian_logp
 from runs import (
     COUNT,
@@ -168,8 +169,8 @@ def policy_step(char, ref, policy, n=2000):
 
 
 SETTINGS = [  # (substeps, solver, iterations); the first is what the others are compared with
-    (16, "NEWTON", 50), (8, "PGS", 5), (4, "NEWTON", 50), (4, "NEWTON", 3), (4, "CG", 5), (4, "PGS", 3), (4, "PGS", 5),
-    (4, "PGS", 10), (3, "PGS", 5), (2, "PGS", 5),
+    (16, "NEWTON", 100), (8, "PGS", 5), (4, "NEWTON", 100), (4, "CG", 5), (4, "PGS", 3),
+    (4, "PGS", 5), (4, "PGS", 10), (4, "PGS", 20), (4, "PGS", 40), (3, "PGS", 5), (2, "PGS", 5),
 ]  # fmt: skip
 
 
@@ -181,8 +182,8 @@ def physics_table(char, ref, act, envs=256, seconds=1.0, seed=0, threads=0) -> l
     Args      act : function of the Env -> actions (N, u)
     Returns   for each of SETTINGS: substeps, solver, iterations; control_steps_per_s (median);
               root_mm : median distance of the root from the first setting's after `seconds`, of those alive in both;
-              sole_mm : mean depth of the lowest sole where it is below the floor; survived : share;
-              bad : simulations that diverged
+              sole_mm : mean depth of the lowest sole where it is below the floor; slide_cm_s : `metrics.measure`'s
+              foot_slide_cm_s of those who live; survived : share; bad : simulations that diverged
     Test      tests/test_bench.py::test_physics_table
     """
     options = char.model.opt
@@ -193,23 +194,29 @@ def physics_table(char, ref, act, envs=256, seconds=1.0, seed=0, threads=0) -> l
         env = Env(char, ref, envs, seed, threads, substeps=substeps, autoreset=False)
         whole = env.starts[env.starts + steps <= ref.last[env.owner[env.starts]]]  # nobody's sequence ends meanwhile
         env.reset(frames=np.random.default_rng(seed).choice(whole, envs))
-        runs.append((env, [], [], np.ones(envs, bool)))
+        runs.append((env, [], [], np.ones(envs, bool), [env.qpos.copy()]))
     for _ in range(steps):
-        for env, times, depth, alive in runs:
+        for env, times, depth, alive, poses in runs:
             start = time.perf_counter()
             terminated = env.step(act(env))[2]
             times.append(time.perf_counter() - start)
             alive &= ~terminated
+            poses.append(env.qpos.copy())
             low = geom_lowest(char.model, char.sole_geoms.ravel(), env.geom_xpos, env.geom_xmat).min(1)[alive]
             depth.append(-1000 * low[low < 0])
     options.solver, options.iterations, options.timestep = kept
-    rows, (best, *_, alive_best) = [], runs[0]
-    for (substeps, solver, iterations), (env, times, depth, alive) in zip(SETTINGS, runs, strict=True):
+    rows, (best, _, _, alive_best, _) = [], runs[0]
+    for (substeps, solver, iterations), (env, times, depth, alive, poses) in zip(SETTINGS, runs, strict=True):
         both = alive & alive_best
+        lived, none = np.stack(poses, 1)[alive], np.zeros((steps + 1, 2), bool)
+        frames = env.frame[alive, None] + np.arange(-steps, 1)
+        still = np.zeros((steps + 1, env.action_size))
+        records = [Recording(f, q, none, still, False, steps) for f, q in zip(frames, lived, strict=True)]
         apart = 1000 * np.linalg.norm(env.qpos[both, :3] - best.qpos[both, :3], axis=1)
         rows.append({"substeps": substeps, "solver": solver, "iterations": iterations,
                      "control_steps_per_s": float(envs / np.median(times)), "root_mm": float(np.median(apart)),
                      "sole_mm": float(np.concatenate(depth).mean()), "survived": float(alive.mean()),
+                     "slide_cm_s": measure(char, ref, records)["foot_slide_cm_s"],
                      "bad": int((env.batch.warning[:, BAD, 1] > 0).any(1).sum())})  # fmt: skip
     return rows
 
@@ -551,7 +558,7 @@ def main(argv=None):
         print(f"\nskeletal auto-encoder, one core: {r['windows_per_s']:.0f} training windows/s", end="")
         print(f"; PyTorch {r['torch_windows_per_s']:.0f}: ratio {r['torch_ratio']:.2f}" if r["torch_ratio"] else "")
     if opt.peers:
-        char = replace(opt, character=opt.character or "jesse").load()
+        char = replace(opt, character=opt.character or "jesse").load().solved_by("pgs")
         more["peers"] = r = bench_peers(
             char, retarget.reference(char, mocap.sequences(opt.motion, "train", opt.clips)), opt
         )
@@ -561,17 +568,18 @@ def main(argv=None):
         print(f"  an update by PyTorch takes {r['torch_update_ratio']:.2f} × as long")
         print("  CPU seconds an update: " + ", ".join(f"{k} {v:.2f}" for k, v in r["cpu_s"].items()))
     for name in names:
-        char = replace(opt, character=name).load()
+        char = replace(opt, character=name).load().solved_by("pgs")  # as in training
         ref = retarget.reference(char, mocap.sequences(opt.motion, "train", opt.clips))
         if opt.physics:
             policy, _ = ppo.load_policy(character.CHARACTERS / f"{name}.npz")
             act = lambda env: policy.mean_action(env.full[:, : env.obs_size])  # noqa: B023, E731
             results[name] = {"settings": physics_table(char, ref, act, opt.envs, threads=opt.threads)}
             print(f"\n{name}, {opt.envs} characters, its shipped policy, 1 s\n"
-                  "substeps solver iterations  control steps/s  root mm  soles mm  survived  diverged")  # fmt: skip
+                  "substeps solver iterations  control steps/s  "
+                  "root mm  soles mm  slide cm/s  survived  bad")  # fmt: skip
             for row in results[name]["settings"]:
                 print("{substeps:8d} {solver:6s} {iterations:10d} {control_steps_per_s:16,.0f} {root_mm:8.1f} "
-                      "{sole_mm:9.1f} {survived:9.2f} {bad:9d}".format(**row))  # fmt: skip
+                      "{sole_mm:9.1f} {slide_cm_s:11.1f} {survived:9.2f} {bad:4d}".format(**row))  # fmt: skip
             continue
         r = results[name] = bench(char, ref, opt)
         print(f"\n{name}, {opt.envs} characters, control steps/s:")

@@ -63,6 +63,7 @@ CLEANRL = dict(  # [Huang22] ppo_continuous_action.py; Adam's epsilon and the cl
 OF_CHARACTERS = (  # options that mean nothing to a task
     *(f.name for f in fields(character.Switches)), "motion", "clips", "joint_map", "unit", "up", "balance", "retry",
     "stand", "augment", "sensor_offset", "sensor_noise", "push", "episode", "sensors", "without", "track",
+    "solver",
 )  # fmt: skip
 
 

@@ -115,6 +115,11 @@ class Options(character.Switches):
     threads: int = arg(
         0, "physics threads, 0 = all cores; if not 1, actor and critic learn side by side", check=THREADS
     )
+    solver: str = arg(
+        "pgs",
+        "of contacts: pgs, a third faster, or newton, exact, as when playing; to end with",
+        choices=tuple(character.SOLVERS),
+    )
     checkpoint_minutes: float = arg(3.0, "minutes between checkpoints", check=NONNEGATIVE)
     gamma: float = arg(0.97, "discount (QuestSim's)", check=UNIT)
     lam: float = arg(0.95, "lambda of generalised advantage estimation; 1 is Appendix B's return", check=UNIT)
@@ -839,7 +844,7 @@ def make_envs(opt: Options) -> list[Env] | list[Task]:
         return [Task(opt.gym, opt.envs, opt.seed, opt.gamma, opt.reward_norm, opt.limit_ends)]
     if opt.reward_norm or opt.limit_ends:
         raise UserError("--reward-norm and --limit-ends are of tasks: give --gym, or leave them out")
-    char = ablated(opt.load(), opt.without, opt.track)
+    char = ablated(opt.load(), opt.without, opt.track).solved_by(opt.solver)
     clips = mocap.sequences(opt.motion, "train", opt.clips, seed=opt.seed, reading=Reading.of(opt))
     if opt.augment:
         clips = mocap.augment(clips, np.random.default_rng([opt.seed, 3]))

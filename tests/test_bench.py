@@ -58,9 +58,10 @@ def test_physics_table():
     rows = bench.physics_table(char, ref, lambda env: np.zeros((env.n, env.action_size)), 32, 0.3, threads=1)
     by = {(r["substeps"], r["solver"], r["iterations"]): r for r in rows}
     assert list(by) == bench.SETTINGS and rows[0]["root_mm"] == 0.0
-    assert by[16, "NEWTON", 50]["control_steps_per_s"] < by[2, "PGS", 5]["control_steps_per_s"]
-    apart = {by[4, *k]["root_mm"] for k in (("NEWTON", 50), ("CG", 5), ("PGS", 3), ("PGS", 5), ("PGS", 10))}
-    assert len(apart) == 5, apart  # every setting is another physics
+    assert by[16, "NEWTON", 100]["control_steps_per_s"] < by[2, "PGS", 5]["control_steps_per_s"]
+    apart = {r["root_mm"] for r in rows if r["substeps"] == 4}
+    assert len(apart) == 7, apart  # every setting is another physics
+    assert all(1.0 < r["slide_cm_s"] < 100.0 for r in rows)
     assert by[4, "PGS", 10]["root_mm"] < by[2, "PGS", 5]["root_mm"] < 50
     assert all(r["bad"] == 0 and 0 < r["sole_mm"] < 50 and r["survived"] > 0.5 for r in rows)
     assert before == (char.model.opt.solver, char.model.opt.iterations)

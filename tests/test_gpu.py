@@ -30,8 +30,7 @@ def test_worlds_are_mujoco(char):
     m, n = character.load("jesse").model, 3
     m.opt.timestep = 1 / 120
     worlds = gpu.Worlds(m, n, "cpu")
-    assert m.opt.solver == mujoco.mjtSolver.mjSOL_PGS  # as it was
-    m.opt.solver, m.opt.iterations = mujoco.mjtSolver.mjSOL_NEWTON, 100
+    assert (m.opt.solver, m.opt.iterations) == character.SOLVERS["newton"]  # as it was
     datas = [mujoco.MjData(m) for _ in range(n)]
     for k, d in enumerate(datas):
         d.qpos[2], d.qpos[7:] = char.hip_height - 0.003, char.default
