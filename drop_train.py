@@ -3,7 +3,7 @@ r"""Train, measure and ship DROP's learned priors  [DROP §5, §7].
     python drop_prior.py train --motion FOLDER --out runs/prior     (--resume goes on exactly)
     python drop_prior.py evaluate --motion FOLDER                   reconstruction of held-out clips, calibration
     python drop_prior.py rollout --motion FOLDER --frames 10000     the prior alone and inside DROP, on the manifold?
-    python drop_prior.py ship --out runs/prior                      write weights/drop.npz
+    python drop_prior.py ship --out runs/prior --weights mine.npz   write them, with their data's licence
 
 Training goes by rollouts of K frames from a random frame of the train clips: scheduled sampling feeds the networks
 their own output, ever more often (HuMoR's way), and a share of the states is disturbed as pushes would.  A state that
@@ -605,12 +605,14 @@ def rollout(opt, stride=5):
 
 
 def ship(opt):
-    r"""Write a run's networks for others: float16 weights, the pose bound, how they were trained, the data's licence.
+    r"""Write a run's networks to --weights: float16, the pose bound, how they were trained, the data's licence.
 
     Returns   what was written beside the weights
-    Raises    UserError: the run has no checkpoint
-    Test      tests/test_drop_vae.py::test_shipped
+    Raises    UserError: the run has no checkpoint; no file is named, and the one that is shipped would be lost
+    Test      tests/test_drop_vae.py::test_shipped, test_ship_names_its_file
     """
+    if opt.weights == str(WEIGHTS):
+        raise UserError("drop_prior.py ship: say where to, with --weights FILE.npz")
     motion, pose, meta = load_networks(Path(opt.out) / CHECKPOINT)
     trained = stored_options(Options, opt.out)
     sets = mocap.parts(trained["motion"])

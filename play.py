@@ -201,7 +201,8 @@ def largest_push(char: Character, ref: Reference, act, at, most, sequences=8, ro
     long = np.flatnonzero(ref.last - ref.first >= steps)
     chosen = long[np.unique(np.linspace(0, len(long) - 1, min(sequences, len(long))).round().astype(int))]
     if not len(chosen):
-        raise UserError(f"no sequence is {at + RECOVERY:.1f} s long; push earlier than {at} s")
+        most = np.max(ref.last - ref.first, initial=0) / ref.rate - RECOVERY
+        raise UserError(f"no sequence is {at + RECOVERY:.1f} s long: push before {max(most, 0.0):.1f} s")
     angle = np.tile(list(DIRECTIONS.values()), len(chosen))
     first = np.repeat(ref.first[chosen], len(DIRECTIONS))
     env = Env(char, ref, len(first), threads=threads, horizon=len(ref), autoreset=False)
@@ -758,9 +759,13 @@ def main(argv=None):
     if opt.png or opt.video or opt.bvh:
         recording = simulate(char, seen, policy_action(policy), threads=opt.threads, only=[opt.sequence], push=push)[0]
         last = min(len(recording.frames) - 1, int((opt.seconds or 10.0) * mocap.CONTROL_RATE))
+        if push and push.at * mocap.CONTROL_RATE >= last:
+            shown = f"only {last / mocap.CONTROL_RATE:.1f} s are shown"
+            raise UserError(f"--push {opt.push}: {shown}: push earlier, or give more --seconds")
         print(
             f"{ref.names[opt.sequence]}: lived {(len(recording.frames) - 1) / mocap.CONTROL_RATE:.1f} s "
             f"of {recording.available / mocap.CONTROL_RATE:.1f}"
+            + (f"; pushed by {push.newtons:g} N at {push.at:g} s" if push else "")
         )
         if opt.bvh:
             retarget.write_bvh(opt.bvh, char, recording.qpos, mocap.CONTROL_RATE)

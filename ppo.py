@@ -110,7 +110,7 @@ class Options(character.Switches):
     gain: float = arg(
         1.0, "with --ship: makes the policy's standardised observations so many times as large", check=POSITIVE
     )
-    init: str | None = arg(None, "start from the weights of a policy (.npz) or a run folder")
+    init: str | None = arg(None, "start from the weights of a policy (.npz) or a run folder, with layers as wide")
     gpu: bool = arg(False, "train on an NVIDIA GPU (extra gpu); give thousands of --envs")
     threads: int = arg(
         0, "physics threads, 0 = all cores; if not 1, actor and critic learn side by side", check=THREADS
@@ -617,6 +617,7 @@ class Trainer:
             length=float(lengths.mean()) if len(lengths) else float("nan"),
             survival=float(shares.mean()) if len(shares) else float("nan"),
             time_to_failure=seconds / max(int(self.terminated.sum()), 1),
+            failures=int(self.terminated.sum()),
             reward=float(self.reward.mean()),
         )
         stats |= {f"r_{k}": sum(part[k] for part in sums) / (self.opt.horizon * self.n) for k in self.env.TERMS}
@@ -1024,7 +1025,7 @@ def progress_line(s) -> dict:
     known = {"return of 100": f"{s['return_100']:.0f}"} if "return_100" in s else {}
     return known | {
         "steps/s": f"{s['steps_per_s']:.0f}",
-        "fails every": f"{s['time_to_failure']:.2f} s",
+        "fails every": f"{s['time_to_failure']:.2f} s" if s["failures"] else "never",
         "survival": f"{s['survival']:.2f}",
         "reward": f"{s['reward']:.2f}",
         "[": f"{terms} ]",
@@ -1043,12 +1044,18 @@ def main(argv=None):
     opt = replace(opt, out=opt.out or f"runs/{Path(opt.gym or opt.character).stem}")
     if not opt.ship and (opt.blend or opt.gain != 1.0 or opt.share != 0.5):
         raise UserError("--blend, --share and --gain are of --ship FILE.npz: give it, or leave them out")
+    if not opt.blend and opt.share != 0.5:
+        raise UserError("--share is of --blend A,B,…: give it, or leave it out")
     if opt.ship:
         meta = ship(opt.out, opt.ship, opt.blend, opt.share, opt.gain)
-        print(f"{opt.ship}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}; {meta['licence']}")
+        mixed = f", {1 - opt.share:g} of it and {opt.share:g} of {', '.join(opt.blend)}" if opt.blend else ""
+        print(f"{opt.ship}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}{mixed}; {meta['licence']}")
         return
     if opt.resume:
         opt = resumed_options(opt, argv)
+    elif opt.init:  # as wide as what it begins from, unless told otherwise
+        policy, given = load_policy(opt.init)[0], given_flags(argv)
+        opt = replace(opt, **{k: getattr(policy, k) for k in ("hidden", "value_hidden") if k not in given})
     train(opt)
 
 

@@ -25,6 +25,9 @@ from runs import UserError, atomic_path, atomic_write, read_metrics
 _PROBE = "import sys, importlib as i; c = i.import_module('mujoco.' + sys.argv[1]).GLContext(8, 8); c.make_current()"
 
 
+ADVICE = "install Debian's libegl1 and libgl1-mesa-dri, or libosmesa6, and set MUJOCO_GL to egl or osmesa"
+
+
 def gl_backend():
     """The OpenGL back end to use: MUJOCO_GL if set, glfw with a display, else egl or osmesa; None if neither starts.
 
@@ -45,16 +48,15 @@ def gl_backend():
 
 def _gl_context(width, height):
     name = gl_backend()
-    advice = "install Debian's libegl1 and libgl1-mesa-dri, or libosmesa6, and set MUJOCO_GL to egl or osmesa"
     if name is None:
-        raise UserError(f"no picture without OpenGL, and neither egl nor osmesa starts: {advice}")
+        raise UserError(f"no picture without OpenGL, and neither egl nor osmesa starts: {ADVICE}")
     try:
         os.environ.setdefault("MUJOCO_GL", name)
         context = importlib.import_module("mujoco." + name).GLContext(width, height)
         context.make_current()
         return context
     except Exception as error:  # the back ends raise many kinds
-        raise UserError(f"OpenGL back end {name} does not start ({type(error).__name__}: {error}): {advice}") from None
+        raise UserError(f"OpenGL back end {name} does not start ({type(error).__name__}: {error}): {ADVICE}") from None
 
 
 # ---- the scene ------------------------------------------------------------------------------------------------------
@@ -129,7 +131,10 @@ class Scene:
         self.gl = _gl_context(width, height)
         self.scene = mujoco.MjvScene(self.model, maxgeom=10_000)
         self.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = not fast
-        self.context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        try:
+            self.context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        except mujoco.FatalError as error:  # glfw without a display gives a context that draws nothing
+            raise UserError(f"OpenGL back end {gl_backend()} does not start ({error}): {ADVICE}") from None
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         self.close = weakref.finalize(self, _release, self.gl, self.context)
 

@@ -73,6 +73,10 @@ def run_main(main_fn, argv=None):
     """
     try:
         code = main_fn(sys.argv[1:] if argv is None else argv)
+        sys.stdout.flush()
+    except BrokenPipeError:  # as in `… | head`: nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        code = 141  # what a shell calls SIGPIPE
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         code = 2

@@ -389,6 +389,14 @@ def shipped():
     return load_networks()
 
 
+def test_ship_names_its_file(tmp_path):
+    """The weights that came with the project are never the default."""
+    before = training.WEIGHTS.read_bytes()
+    with pytest.raises(UserError, match="say where to, with --weights FILE.npz"):
+        training.main(["ship", "--out", str(tmp_path)])
+    assert training.WEIGHTS.read_bytes() == before
+
+
 def test_shipped():
     """Small, licensed."""
     _, _, meta = shipped()

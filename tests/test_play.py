@@ -284,6 +284,12 @@ def test_what_cannot_be_done_is_said_first(policy_file, tmp_path):
             play.main(["--policy", str(policy_file), "--measure", flag, str(tmp_path / "none" / name)])
     with pytest.raises(UserError, match="--sequence 7: there are 1, from 0"):
         play.main(["--policy", str(policy_file), "--measure", "--sequence", "7", "--clips", "walk_005"])
+    late = ["--policy", str(policy_file), "--clips", "walk_005", "--push", "100@9000"]
+    with pytest.raises(UserError, match="no sequence is 9003.0 s long: push before [1-9]"):
+        play.main([*late, "--measure"])
+    with pytest.raises(UserError, match="--push 100@9000: only .* s are shown: push earlier, or give more --seconds"):
+        play.main([*late, "--bvh", str(tmp_path / "walk.bvh")])
+    assert not (tmp_path / "walk.bvh").exists()
     compare = ["--compare", str(policy_file), str(policy_file.with_name("q.npz"))]
     for wrong, says in (
         (compare[:2], "two policies or more, none twice"),

@@ -756,6 +756,27 @@ def test_init_widens():
         Policy(9, 11, 3, (8, 5), (7,), 0.1, 2.0, rng).begin_from(old, "a.npz", rng)
 
 
+def test_init_brings_its_widths(whole, tmp_path):
+    """Layers are as wide as those of --init where the command line does not say; --share alone averages nothing."""
+    small = [a for a in TINY if a not in ("--hidden", "12", "--value-hidden", "10,8")]
+    ppo.main([*small, "--init", str(whole), "--steps", "64", "--out", str(tmp_path / "a")])
+    policy, _ = ppo.load_policy(tmp_path / "a")
+    assert (policy.hidden, policy.value_hidden) == ((12,), (10, 8))
+    ppo.main([*small, "--init", str(whole), "--hidden", "20", "--steps", "64", "--out", str(tmp_path / "b")])
+    policy, _ = ppo.load_policy(tmp_path / "b")
+    assert (policy.hidden, policy.value_hidden) == ((20,), (10, 8))
+    with pytest.raises(UserError, match="--share is of --blend"):
+        ppo.main(["--ship", str(tmp_path / "c.npz"), "--share", "0.3", "--out", str(tmp_path / "a")])
+    assert not (tmp_path / "c.npz").exists()
+
+
+def test_line_of_progress(char, ref):
+    t = trainer_of(char, ref, horizon=1)
+    stats = t.collect() | dict.fromkeys(("steps_per_s", "kl", "clip_fraction", "explained_variance", "sigma"), 0.0)
+    assert stats["failures"] == 0 and ppo.progress_line(stats)["fails every"] == "never"
+    assert ppo.progress_line(stats | {"failures": 2, "time_to_failure": 1.5})["fails every"] == "1.50 s"
+
+
 def test_init_symmetric(whole, tmp_path, capsys, char, ref):
     """§5.3: the actor goes on, the critic, which sees less, begins; the other way round nothing fits."""
     _, meta = train(tmp_path / "a", 1, "--init", str(whole), "--without", "asymmetric")

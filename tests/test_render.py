@@ -146,6 +146,18 @@ def test_no_opengl_is_a_clear_error(monkeypatch):
         render.Scene(mujoco.MjModel.from_xml_string(XML))
 
 
+def test_back_end_that_draws_nothing(monkeypatch):
+    """glfw without a display: its context is made, and fails when it is used."""
+
+    def fails(*_):
+        raise mujoco.FatalError("no OpenGL platform library")
+
+    monkeypatch.setattr(mujoco, "MjrContext", fails)
+    monkeypatch.setattr(render, "_gl_context", lambda *_: None)
+    with pytest.raises(UserError, match="does not start .no OpenGL platform library.: install .*libegl1"):
+        render.Scene(mujoco.MjModel.from_xml_string(XML))
+
+
 def decode_png(raw):
     """A second reader: walks the chunks, checks each CRC, and undoes filter 0."""
     assert raw[:8] == b"\x89PNG\r\n\x1a\n"

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -98,6 +99,14 @@ def test_run_main(error, code, told, capsys):
         runs.run_main(main, [])
     assert stopped.value.code == code
     assert capsys.readouterr().err == told
+
+
+def test_broken_pipe():
+    """`… | head` ends a command without a word."""
+    code = "import runs; runs.run_main(lambda argv: [print('line') for _ in range(10**5)] and None)"
+    command = f"{shlex.quote(sys.executable)} -c {shlex.quote(code)} | head -1"
+    done = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout == "line\n" and done.stderr == ""
 
 
 def test_user_error_is_one_line():
