@@ -35,7 +35,7 @@ from character import Character
 from env import EPISODE_STEPS, SENSORS, Env, headset_only
 from metrics import Recording, as_json, comparison, measure, table
 from mocap import heading
-from ppo import check_fits, load_policy, sensors_of, trained_as
+from ppo import check_fits, load_policy, sensors_of, total_steps, trained_as
 from retarget import Reference, forward_kinematics, sole_motion
 from rigs import HELP, Reading
 from runs import (
@@ -351,9 +351,7 @@ class Arm:
     def title(self) -> str:
         """What it is, in a line.  Test: tests/test_play.py::test_compare"""
         options, parts = self.meta.get("options", {}), [name_of(self.char)]
-        if isinstance(self.meta.get("steps"), int):
-            since = f" since {options['init']}" if options.get("init") else ""
-            parts.append(f"{fmt_count(self.meta['steps'])} steps{since}")
+        parts += [f"{fmt_count(steps)} steps"] if (steps := total_steps(self.meta)) else []
         parts += [f"without {' '.join(map(str, options['without']))}"] if options.get("without") else []
         parts += ["root tracked only"] if options.get("track") == "root" else []
         if sensors_of(self.meta, self.path) == "hmd":

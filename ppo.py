@@ -484,6 +484,13 @@ def blended(policy: Policy, others: list[Policy], share: float) -> Policy:
     return policy
 
 
+def total_steps(meta) -> int:
+    """Control steps that a policy has seen, those of the policies that it went on from with --init included.
+
+    Test      tests/test_ppo.py::test_ship"""
+    return sum(meta[k] for k in ("steps", "before") if type(meta.get(k)) is int)
+
+
 def _body(meta, path) -> tuple:
     """Which body a policy was trained with: the character and its variation, rewards left out; () of none named."""
     own = trained_as(meta, path)
@@ -527,9 +534,8 @@ def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     licences = [f"weights trained on {text}" for text in mocap.licences(sets)]
     if "licence" in meta:  # was shipped before
         licences = [str(meta["licence"])] if meta["licence"] != "MIT" else []
-    kept = {k: meta[k] for k in ("policy", "steps", "data")}
-    init = meta["options"]["init"] and Path(meta["options"]["init"]).name
-    kept["options"] = meta["options"] | {"motion": ",".join(Path(s).name for s in sets), "out": None, "init": init}
+    kept = {"policy": meta["policy"], "steps": total_steps(meta), "data": meta["data"]}
+    kept["options"] = meta["options"] | {"motion": ",".join(Path(s).name for s in sets), "out": None, "init": None}
     policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})
     kept |= {"gain": gain} if gain != 1.0 else {}
     if blend:
@@ -956,23 +962,25 @@ def train(opt: Options) -> Trainer:
     # The configuration is checked and the motions are read before the folder is made: a typo leaves nothing behind.
     trainer = Trainer(opt, *make_envs(opt))
     opt, env = trainer.opt, trainer.env
+    before = loaded[1].get("before", 0) if loaded else 0  # steps of the policies that it goes on from
     if opt.init and not loaded:  # a run resumed before its first checkpoint begins as it began
         policy = initial_policy(opt.init, env, opt.sigma)
+        before = total_steps(load_policy(opt.init)[1])
         trainer.policy.begin_from(policy, opt.init, np.random.default_rng([opt.seed, 4]))
         np.maximum(trainer.policy.log_std, np.log(opt.min_sigma), out=trainer.policy.log_std)
     data = env.data() if opt.gym else {
         "fingerprint": fingerprint(env.ref), "sequences": len(env.ref.names), "minutes": len(env.ref) * env.dt / 60
     }  # fmt: skip
-    before = loaded[1].get("data", data) if loaded else data
-    if not isinstance(before, dict) or before.get("fingerprint") != data["fingerprint"]:
+    seen = loaded[1].get("data", data) if loaded else data
+    if not isinstance(seen, dict) or seen.get("fingerprint") != data["fingerprint"]:
         raise UserError(
             f"{out}: the {'task has' if opt.gym else 'motions have'} changed since the run began "
-            f"({before} against {data}); start a new run with --init {out}"
+            f"({seen} against {data}); start a new run with --init {out}"
         )
     with ExitStack() as stack:
         if opt.gpu:
             stack.enter_context(gpu.arrays_of(gpu.moved(trainer)))
-        _loop(trainer, loaded, {"options": asdict(opt), "data": data}, time.perf_counter() - began)
+        _loop(trainer, loaded, {"options": asdict(opt), "data": data, "before": before}, time.perf_counter() - began)
     return trainer
 
 

@@ -1033,6 +1033,9 @@ def test_ship(tmp_path, monkeypatch):
     assert target.stat().st_size < 4e6
     assert str(tmp_path) not in json.dumps(meta)  # no path of the machine
     ppo.main(["--motion", f"builtin,{folder},standing", "--out", str(tmp_path / "both"), *size])
+    ppo.main(["--motion", str(folder), "--init", str(target), "--out", str(tmp_path / "more"), *size])
+    more = ppo.ship(tmp_path / "more", tmp_path / "more.npz")
+    assert more["steps"] == 32 == ppo.total_steps(ppo.load_policy(tmp_path / "more")[1]) and not more["options"]["init"]
     assert ppo.ship(tmp_path / "both", target)["licence"] == meta["licence"]
     assert ppo.load_policy(target)[1]["options"]["motion"] == "builtin,motion,standing"
     with pytest.raises(UserError):
