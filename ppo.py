@@ -117,7 +117,7 @@ class Options(character.Switches):
     )
     solver: str = arg(
         "pgs",
-        "of contacts: pgs, a third faster, or newton, exact, as when playing; to end with",
+        "of contacts: pgs, a fifth faster, or newton, exact, as when playing; to end with",
         choices=tuple(character.SOLVERS),
     )
     checkpoint_minutes: float = arg(3.0, "minutes between checkpoints", check=NONNEGATIVE)
