@@ -228,6 +228,17 @@ def test_stiff_knee(full):
     assert stiff < free - 10 and other > stiff + 10
 
 
+def test_nobody_runs_without_a_run(stage, monkeypatch, capsys):
+    """A motion of walks alone has no runner to push, whatever its fastest walk."""
+    walks = [c for c in stage.clips if demos.pace(c[1]) < demos.RUN]
+    monkeypatch.setattr(stage, "clips", walks)
+    monkeypatch.setattr(demos, "single", lambda name, *_: demos.Take(name))
+    for name in ("_centres", "_displacement"):
+        monkeypatch.setattr(demos, name, lambda *_: None)
+    names = [t.name for t in demos.push(stage, None)]
+    assert len(names) == 6 and all(n.startswith("walk ") for n in names) and "no clip runs" in capsys.readouterr().out
+
+
 def test_a_small_push_displaces_and_a_large_one_more(stage, monkeypatch):
     """The torso's small push moves a walker against the unpushed take, by less than a large one, and fells nobody."""
     monkeypatch.setattr(demos, "PUSHES", {"torso": demos.PUSHES["torso"]})
