@@ -76,7 +76,7 @@ class Character:
     def solved_by(self, solver: str) -> Character:
         """The same character, its contacts solved from now on by one of SOLVERS; as loaded, by what its MJCF says.
 
-        Why       training can bear feet that creep by half a centimetre a second more, and its physics costs a fifth less
+        Why       training can bear feet that creep by half a centimetre a second more, for physics a fifth cheaper
         Test      tests/test_characters.py::test_solvers"""
         self.model.opt.solver, self.model.opt.iterations = SOLVERS[solver]
         return self
