@@ -75,15 +75,15 @@ class Retargeter:
                 raise UserError(f"{path}: generator{k} has {theta.size} numbers, expected {net.theta.size}")
             net.theta[:] = theta
 
-    def which(self, names) -> int:
-        """The structure that has these joints."""
+    def which(self, names, path) -> int:
+        """The structure that has the joints of a file."""
         for k, d in enumerate(self.domains):
             if set(d.names) == set(names):
                 return k
         known = "; or ".join(", ".join(d.names) for d in self.domains)
         raise UserError(
-            f"no trained structure has the joints {', '.join(names)}; valid: {known}; for another rig train on it "
-            "(skeletal.py train --a FOLDER --b FOLDER)"
+            f"{path}: no trained structure has its joints, {', '.join(names)}; valid: {known}; "
+            "for another rig train on it (skeletal.py train --a FOLDER --b FOLDER)"
         )
 
     def __call__(self, m: Motion, source, target: Skeleton, to) -> Motion:
@@ -140,7 +140,7 @@ def retarget(argv) -> int:
 
     def read(path):
         raw = data.read_rig(path, opt.up, patterns)
-        k = net.which(raw.names)
+        k = net.which(raw.names, path)
         if up(k) != opt.up:  # a trained structure knows its axis
             raw = data.read_rig(path, up(k), patterns)
         return k, data.to_motion(raw, net.domains[k].structure)
@@ -153,6 +153,8 @@ def retarget(argv) -> int:
         if not number.isdigit() or int(number) >= len(cast):
             raise UserError(f"--target {opt.target}: no such character; valid: {word}/0 to {word}/{len(cast) - 1}")
         target = cast[int(number)]
+    elif word.isalpha() and len(word) == 1 and number.isdigit():
+        raise UserError(f"--target {opt.target}: valid: A or B and the number of a character, as B/3, or a .bvh file")
     else:
         to, other = read(opt.target)
         target = other.skeleton
@@ -167,7 +169,8 @@ def retarget(argv) -> int:
     if opt.out:
         data.write_motion(opt.out, out, net.domains[to].structure)
     if opt.png or opt.video:
-        _pictures([m, out], ["source", "retargeted"], opt.png, opt.video, opt.every)
+        _pictures([m, out], ["source: blue", "retargeted: orange"], opt.png, opt.video, opt.every)
+    print(*filter(None, (opt.out, opt.png, opt.video)), sep="\n")
     return 0
 
 
