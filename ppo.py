@@ -116,9 +116,7 @@ class Options(character.Switches):
         0, "physics threads, 0 = all cores; if not 1, actor and critic learn side by side", check=THREADS
     )
     solver: str = arg(
-        "pgs",
-        "of contacts: pgs, a fifth faster, or newton, exact, as when playing; to end with",
-        choices=tuple(character.SOLVERS),
+        "pgs", "of contacts: pgs, a fifth faster, or newton, exact, as when playing", choices=tuple(character.SOLVERS)
     )
     checkpoint_minutes: float = arg(3.0, "minutes between checkpoints", check=NONNEGATIVE)
     gamma: float = arg(0.97, "discount (QuestSim's)", check=UNIT)
@@ -672,9 +670,8 @@ class Trainer:
         t, n = self.reward.shape
         self.old_value = policy.value(self.x.reshape(t * n, -1), two=self.two).reshape(t, n)
         self.next_value[:-1] = self.old_value[1:]
-        self.next_value[-1] = policy.value(
-            policy.norm.normalise(self.full)
-        )  # App. B: bootstrap at the trajectory's end
+        # App. B: bootstrap at the trajectory's end
+        self.next_value[-1] = policy.value(policy.norm.normalise(self.full))
         for step, ids, rows in finals:  # truncation is not failure
             self.next_value[step, ids] = policy.value(rows)
         self.next_value[self.terminated] = 0.0
@@ -822,23 +819,12 @@ def environments(char, ref, opt: Options) -> list[Env]:
     sizes = [opt.envs - opt.envs // 2, opt.envs // 2]
     if opt.envs < HALVES or opt.gpu or opt.norm_each_step:
         sizes = [opt.envs]
-    disturbance = Disturbance(opt.sensor_offset, opt.sensor_noise, opt.push)
-    return [
-        Env(
-            char,
-            ref,
-            n,
-            [opt.seed, k],
-            opt.threads,
-            opt.episode,
-            disturbance=disturbance,
-            balance=opt.balance,
-            asymmetric="asymmetric" not in opt.without,
-            retry=opt.retry,
-            stand=opt.stand,
-        )  # fmt: skip
-        for k, n in enumerate(sizes)
-    ]
+    settings = dict(
+        threads=opt.threads, horizon=opt.episode, balance=opt.balance, retry=opt.retry, stand=opt.stand,
+        disturbance=Disturbance(opt.sensor_offset, opt.sensor_noise, opt.push),
+        asymmetric="asymmetric" not in opt.without,
+    )  # fmt: skip
+    return [Env(char, ref, n, [opt.seed, k], **settings) for k, n in enumerate(sizes)]
 
 
 def make_envs(opt: Options) -> list[Env] | list[Task]:
