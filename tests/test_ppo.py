@@ -581,7 +581,7 @@ def test_halves(char, ref):
             np.testing.assert_array_equal(t.reward[step, rows], reward)
             after = value(np.where(truncated[:, None], info.get("final_critic", twin.full), twin.full))
             expected = np.where(terminated, 0.0, after)
-            np.testing.assert_allclose(t.next_value[step, rows], expected, rtol=1e-4, atol=1e-4)
+            np.testing.assert_allclose(t.next_value[step, rows], expected, rtol=1e-4, atol=0.01)  # of 1,000
             for name in terms:
                 terms[name] += info["terms"][name].sum() / (12 * 65)
         assert truncated.sum() + t.truncated[:, rows].sum() > 20
