@@ -755,20 +755,21 @@ def main(argv=None):
         if opt.json:
             atomic_write(opt.json, as_json(results))
     if opt.png or opt.video or opt.bvh:
+        last = int((opt.seconds or 10.0) * mocap.CONTROL_RATE) if opt.png or opt.video else EPISODE_STEPS
+        shown = min(last, EPISODE_STEPS, int(ref.last[opt.sequence] - ref.first[opt.sequence])) / mocap.CONTROL_RATE
+        if push and push.at >= shown:
+            says = f"only {shown:.1f} s are shown: push earlier, or give more --seconds"
+            raise UserError(f"--push {opt.push}: {says}")
         recording = simulate(char, seen, policy_action(policy), threads=opt.threads, only=[opt.sequence], push=push)[0]
-        last = min(len(recording.frames) - 1, int((opt.seconds or 10.0) * mocap.CONTROL_RATE))
-        if push and push.at * mocap.CONTROL_RATE >= last:
-            shown = f"only {last / mocap.CONTROL_RATE:.1f} s are shown"
-            raise UserError(f"--push {opt.push}: {shown}: push earlier, or give more --seconds")
+        lived = (len(recording.frames) - 1) / mocap.CONTROL_RATE
         print(
-            f"{ref.names[opt.sequence]}: lived {(len(recording.frames) - 1) / mocap.CONTROL_RATE:.1f} s "
-            f"of {recording.available / mocap.CONTROL_RATE:.1f}"
-            + (f"; pushed by {push.newtons:g} N at {push.at:g} s" if push else "")
+            f"{ref.names[opt.sequence]}: lived {lived:.1f} s of {recording.available / mocap.CONTROL_RATE:.1f}"
+            + (f"; pushed by {push.newtons:g} N at {push.at:g} s" if push and push.at < lived else "")
         )
         if opt.bvh:
             retarget.write_bvh(opt.bvh, char, recording.qpos, mocap.CONTROL_RATE)
             print(opt.bvh)
-        _write_pictures(char, seen, recording, last, opt)
+        _write_pictures(char, seen, recording, min(last, len(recording.frames) - 1), opt)
     if opt.view:
         show(char, seen, policy, opt.sequence, opt.view, opt.port, push)
 

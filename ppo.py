@@ -495,12 +495,8 @@ def _body(meta, path) -> tuple:
     if own is None:
         return ()
     changes = {c.strip() for c in (own.set or "").split(";")}
-    return (
-        Path(own.character).stem,
-        own.tail,
-        own.scale,
-        *sorted(c for c in changes if c and not c.startswith("reward")),
-    )
+    body = sorted(c for c in changes if c and not c.startswith("reward"))
+    return Path(own.character).stem, own.tail, own.scale, *body
 
 
 def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
@@ -1035,10 +1031,10 @@ def main(argv=None):
     """python ppo.py: train, or resume.  Test: tests/test_cli.py::test_ppo"""
     of_gym = any(a.split("=")[0] == "--gym" for a in argv)
     opt = cli(with_defaults_of_cleanrl(Options) if of_gym else Options, argv, "ppo.py", __doc__)
-    opt = replace(opt, out=opt.out or f"runs/{Path(opt.gym or opt.character).stem}")
-    if not opt.ship and (opt.blend or opt.gain != 1.0 or opt.share != 0.5):
+    opt, given = replace(opt, out=opt.out or f"runs/{Path(opt.gym or opt.character).stem}"), given_flags(argv)
+    if not opt.ship and given & {"blend", "share", "gain"}:
         raise UserError("--blend, --share and --gain are of --ship FILE.npz: give it, or leave them out")
-    if not opt.blend and opt.share != 0.5:
+    if not opt.blend and "share" in given:
         raise UserError("--share is of --blend A,B,…: give it, or leave it out")
     if opt.ship:
         meta = ship(opt.out, opt.ship, opt.blend, opt.share, opt.gain)
@@ -1048,7 +1044,7 @@ def main(argv=None):
     if opt.resume:
         opt = resumed_options(opt, argv)
     elif opt.init:  # as wide as what it begins from, unless told otherwise
-        policy, given = load_policy(opt.init)[0], given_flags(argv)
+        policy, _ = load_policy(opt.init)
         opt = replace(opt, **{k: getattr(policy, k) for k in ("hidden", "value_hidden") if k not in given})
     train(opt)
 

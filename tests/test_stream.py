@@ -494,10 +494,7 @@ def test_calibration_scales_as_training(walk):
     head, turn = np.tile([4.0, -2.0, top], (50, 1)), np.tile([1.0, 0, 0, 0], (50, 1))
     for change in ("root.scale_xy=0.5", "sensors.scale_z=0.7", 'sensors.scale_z="hip"', 'sensors.scale_z="headset"'):
         c = character.load("jesse", set=(change,))
-        found, trained = (
-            stream.calibrate(c, head, turn).scale,
-            retarget.sensor_scale(c, hips, top),
-        )
+        found, trained = stream.calibrate(c, head, turn).scale, retarget.sensor_scale(c, hips, top)
         np.testing.assert_allclose(found, trained, rtol=0.01, err_msg=change)  # hips are guessed from the headset
 
 
