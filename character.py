@@ -22,7 +22,8 @@ import numpy as np
 from mujoco.batch import Batch
 
 from human import SEG, SEGMENTS, quat_mul
-from runs import POSITIVE, UserError, arg, read_text, read_toml
+from plumbing.cli import POSITIVE, UserError, arg
+from plumbing.files import read_text, read_toml
 
 CHARACTERS = Path(__file__).resolve().parent / "characters"
 TERMS = ("q", "qd", "x", "xd", "contact", "orientation", "action_diff", "action_min")  # Table 2's rows
@@ -227,7 +228,7 @@ CLAIMS = dict(  # element of an MJCF -> attributes whose product may be so large
 def check_claims(path, seen=()):
     """UserError if an MJCF, or one that it includes, is no XML, or asks MuJoCo for much more than its own size.
 
-    Test      tests/test_fuzz.py::test_what_is_meant_to_hurt"""
+    Test      tests/robustness/test_fuzz.py::test_what_is_meant_to_hurt"""
     copies, included, parser = [1.0], [], expat.ParserCreate()
 
     def start(tag, attributes):

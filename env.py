@@ -20,11 +20,12 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-import mocap
 from character import TERMS, Character, geom_lowest, load
-from mocap import heading, quat_angle
-from retarget import STAGE_VEL, Reference, body_velocity, headset, reference, standing
-from runs import UserError, rng_from_state, rng_state
+from human import heading, quat_angle
+from mocap import data
+from plumbing.cli import UserError
+from plumbing.runs import rng_from_state, rng_state
+from retarget import STAGE_VEL, Reference, body_velocity, reference, standing
 
 ROOT_LIMIT = 0.30  # m  [Reda23 §3.6]; ASSUMED in 3-D
 FORCE_LIMIT = 1.0  # N  [Reda23 App. A]
@@ -167,11 +168,12 @@ def input_names(char: Character, devices=3, asymmetric=True) -> list[str]:
 def observe(sim, ids, before, now, out) -> HeadingFrame:
     r"""The actor's observation [Reda23 Eq. 2]: o_t = [o_{t,sim}, o_{t-1,user}, o_{t,user}].
 
-    Args      sim : has char, slices, and the bound arrays qpos, qvel, cvel, xpos, xmat: an Env, or `stream.Player`
+    Args      sim : has char, slices, and the bound arrays qpos, qvel, cvel, xpos, xmat: an Env, or
+              `headset.player.Player`
               ids : rows of it; before, now : (pos, rot) of the devices as `observe_user` takes them
               out (N, at least the actor's size) is filled
     Returns   the heading frame
-    Test      tests/test_env.py::test_observation_terms, tests/test_stream.py::test_player_observes_as_env
+    Test      tests/test_env.py::test_observation_terms, tests/headset/test_stream.py::test_player_observes_as_env
     """
     char, s, links = sim.char, sim.slices, sim.char.obs_links
     qpos, qvel = sim.qpos[ids], sim.qvel[ids]
@@ -406,7 +408,7 @@ class Env:
         self.lived = np.full(len(ref.first), float(horizon))
         self.retry = retry
         self.lost = np.zeros(PLACES, int)  # `retry`: frames at which episodes failed of late; 0: none yet
-        self.stand, self.headset = stand, headset(char) if stand else None
+        self.stand = stand
 
     def attach(self, batch):
         """Where the simulations are: state and kinematics as arrays that share their memory."""
@@ -419,11 +421,13 @@ class Env:
         self.disabled = self.batch.expand("opt.disableflags")
 
     def value_scale(self, gamma):
-        """The largest return, which makes a critic's output of order 1.  Test: tests/test_gym_env.py::test_interface"""
+        """The largest return, which makes a critic's output of order 1.
+
+        Test      tests/extras/test_gym_env.py::test_interface"""
         return sum(self.char.reward[t][0] for t in TERMS) / max(1.0 - gamma, 1e-3)
 
     def stats(self) -> dict:
-        """What else a line of progress should tell: nothing.  Test: tests/test_gym_env.py::test_interface"""
+        """What else a line of progress should tell: nothing.  Test: tests/extras/test_gym_env.py::test_interface"""
         return {}
 
     # ---- reset
@@ -462,14 +466,15 @@ class Env:
         self.refresh(ids)
 
     def _stand(self, ids):
-        """Environments ids start as a stream does (`stream.Player`): in the default pose under the user's headset, as
+        """Environments ids start as a stream does (`headset.player.Player`): in the default pose under the user's
+        headset, as
         fast as it; where the root would be too far from the human's (a user who crouches, leans), as before.
 
         Why       a user who puts the headset on, or whose character has fallen, is not in the default pose
         Note      with `balance` a failure of such a start counts as one of the sequence that it was in
         Test      tests/test_env.py::test_standing_starts"""
         ref, f = self.ref, self.frame[ids]
-        pose = standing(self.char, self.headset, ref.sensor_pos[f, 0], ref.sensor_quat[f, 0])
+        pose = standing(self.char, ref.sensor_pos[f, 0], ref.sensor_quat[f, 0])
         near = ~too_far(pose[:, :3], ref.qpos[f, :3])
         ids, f = ids[near], f[near]
         self.qpos[ids], self.qvel[ids] = pose[near], 0.0
@@ -694,7 +699,7 @@ class Env:
         """Continue from what `state` returned.  -> obs, info as from `reset`
 
         Raises    ValueError: another environment's state
-        Test      tests/test_env.py::test_state_continues_exactly, tests/test_fuzz.py::test_run_folders"""
+        Test      tests/test_env.py::test_state_continues_exactly, tests/robustness/test_fuzz.py::test_run_folders"""
         own = {"state": self.batch.state} | {k: getattr(self, k) for k in self.state()[0] if k != "state"}
         for name, need in own.items():
             have = arrays[name]
@@ -722,21 +727,22 @@ class Env:
 
 
 def as_gymnasium(char="jesse", ref: Reference | None = None, n: int | None = None, **settings):
-    """This environment with Gymnasium's interface (extra `gym`): `gym_env.OneCharacter`, or `gym_env.Characters`.
+    """This environment with Gymnasium's interface (extra `gym`): `extras.gym_env.OneCharacter`, or
+    `extras.gym_env.Characters`.
 
     Args      char : a Character (`solved_by("pgs")`: a fifth faster), or what `character.load` takes
               ref : the motions, the built-in ones by default
               n : None for one character, a gymnasium.Env; a number for as many, a gymnasium.vector.VectorEnv
               settings : of `Env`: seed, threads, horizon, substeps, disturbance, balance, retry, stand, asymmetric
     Raises    UserError: gymnasium is not installed, or no such character
-    Test      tests/test_gym_env.py::test_check_env, test_vector_is_the_environment
+    Test      tests/extras/test_gym_env.py::test_check_env, test_vector_is_the_environment
     """
-    import gym_env
+    from extras import gym_env
 
     if not isinstance(char, Character):
         char = load(char)
     if ref is None:
-        ref = reference(char, mocap.sequences("builtin", "train"))
+        ref = reference(char, data.sequences("builtin", "train"))
     if n is None:
         return gym_env.OneCharacter(char, ref, **settings)
     return gym_env.Characters(char, ref, n, **settings)

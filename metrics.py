@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-import mocap
+import human
 from character import Character
-from mocap import quat_angle, quat_conj, quat_mul, quat_rotate
+from human import angular_velocity, quat_angle, quat_conj, quat_mul, quat_rotate
+from plumbing.cli import UserError
 from retarget import Reference, forward_kinematics, sole_motion
-from runs import UserError
 
 
 @dataclass
@@ -55,7 +55,7 @@ def footfalls(contact):
     """How often a foot begins to touch, each beginning counted: spec/metrics.  contact (T, 2) bool -> int
 
     Test      tests/test_metrics.py::test_steps_contacts_and_torques"""
-    return mocap.footfalls(contact, 1.0, apart=0.0)
+    return human.footfalls(contact, 1.0, apart=0.0)
 
 
 def travelled(root):
@@ -76,7 +76,7 @@ def head_rates(quat, rate):
     """Roll and yaw velocity of the head about its own axes.  (T, 4) -> (T, 2) [rad/s]
 
     Test      tests/test_metrics.py::test_metrics_on_known_motion"""
-    return quat_rotate(quat_conj(quat), mocap.angular_velocity(quat, rate))[:, [0, 2]]
+    return quat_rotate(quat_conj(quat), angular_velocity(quat, rate))[:, [0, 2]]
 
 
 def sip_bodies(char: Character):

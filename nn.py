@@ -20,6 +20,8 @@ its source beside it.
 Run `python nn.py` to check the gradient of a network and to time it on this machine.
 """
 
+from __future__ import annotations
+
 import argparse
 import math
 import sys

@@ -28,30 +28,23 @@ import mujoco
 import numpy as np
 
 import character
-import mocap
+import mocap.data
 import retarget
-import stream
-from character import Character
+from character import Character, Switches, load
 from env import EPISODE_STEPS, SENSORS, Env, headset_only
+from headset import calibration
+from headset.player import Pace, Player, drive
+from headset.reader import AXES, GAP, SAMPLE_RATE, Reader, arriving, controllers_hang, is_live, lines_of
+from human import CONTACT_SPEED, heading
 from metrics import Recording, as_json, comparison, measure, table
-from mocap import heading
+from mocap import augment
+from mocap.data import CONTROL_RATE, MOTION
+from mocap.rigs import HELP, Reading
+from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cli, given_flags, run_main
+from plumbing.files import atomic_write, check_folders
+from plumbing.runs import fmt_count
 from ppo import check_fits, load_policy, sensors_of, total_steps, trained_as
 from retarget import Reference, forward_kinematics, sole_motion
-from rigs import HELP, Reading
-from runs import (
-    NONNEGATIVE,
-    POSITIVE,
-    THREADS,
-    UserError,
-    arg,
-    atomic_write,
-    check_folders,
-    cli,
-    fmt_count,
-    given_flags,
-    run_main,
-)
-from stream import AXES, SAMPLE_RATE
 
 # flags that say something of a motion alone, or of a stream alone
 OF_MOTION = {"motion", "clips", "joint_map", "unit", "up", "all", "split", "user_scale", "random_starts", "sequence"}
@@ -59,11 +52,11 @@ OF_STREAM = {"axes", "grip", "sample_rate", "user_height", "realtime"}
 
 
 @dataclass
-class Options(character.Switches):
+class Options(Switches):
     """Which policy, on which motion, and what to make of it."""
 
     character: str | None = arg(None, "name in characters/, or path of a .toml; the policy's own by default, or jesse")
-    motion: str = arg("builtin", mocap.MOTION)
+    motion: str = arg("builtin", MOTION)
     clips: str = arg("*", "shell pattern on clip names")
     joint_map: str | None = arg(None, HELP["joint_map"])
     unit: str | None = arg(None, HELP["unit"])
@@ -292,7 +285,7 @@ def kinematic(char: Character, ref: Reference, horizon=EPISODE_STEPS) -> list[Re
     for a, b in zip(ref.first, ref.last, strict=True):
         frames = np.arange(a, min(b, a + horizon) + 1)
         height, speed = sole_motion(forward_kinematics(char, ref.qpos[frames]).soles, ref.rate)
-        contact = (height < 0.02) & (speed < mocap.CONTACT_SPEED)
+        contact = (height < 0.02) & (speed < CONTACT_SPEED)
         action = np.zeros((len(frames), len(char.limits)))
         out.append(Recording(frames, ref.qpos[frames], contact, action, False, len(frames) - 1))
     return out
@@ -399,7 +392,7 @@ def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320)):
     All at the same moments of one sequence; where a policy had failed its row is empty.  The camera follows.
     Test      tests/test_play.py::test_comparison_sheet
     """
-    import render
+    from plumbing import render
 
     rate, first = arms[0].ref.rate, int(arms[0].ref.first[opt.sequence])
     last = min(len(clip) - 1, EPISODE_STEPS, round((opt.seconds or 10.0) * rate))
@@ -435,9 +428,9 @@ def pictures(char: Character, ref: Reference, recording: Recording, frames, size
     """Images (H, W, 3) of the character with the three sensor poses it was given.
 
     Args      frames : indices into the recording
-    Test      tests/test_cli.py::test_play_png
+    Test      tests/robustness/test_cli.py::test_play_png
     """
-    import render
+    from plumbing import render
 
     shown = char.mjspec().compile()
     scene = render.Scene(shown, *size, fast=fast)
@@ -499,7 +492,7 @@ def _shown_model(char: Character, ref: Reference):
 
     Test      tests/test_play_view.py::test_shown_model
     """
-    import render
+    from plumbing import render
 
     spec = char.mjspec()
     for i, device in enumerate(render.device_markers(ref.sensor_pos[0], ref.sensor_quat[0])):
@@ -570,21 +563,21 @@ def play_stream(char: Character, policy, path, devices: int, opt: Options) -> No
 
     Args      devices : what the policy was trained with; of 3, two hang beside the body with --sensors hmd
     Raises    UserError: the stream cannot be read, or shows no headset for a second
-    Test      tests/test_stream.py::test_command_line, test_stdin, test_web_view
+    Test      tests/headset/test_stream.py::test_command_line, test_stdin, test_web_view
     """
-    live = stream.is_live(opt.stream)
+    live = is_live(opt.stream)
     push = parse_push(opt.push)
     read = 1 if opt.sensors == "hmd" else devices
-    player = stream.Player(char, policy.mean_action, force=push.force if push else None, devices=devices)
+    player = Player(char, policy.mean_action, force=push.force if push else None, devices=devices)
     check_fits(policy, player, path)
-    source = stream.Stream(
+    source = calibration.Stream(
         char, opt.axes, sample_rate=opt.sample_rate, grip=opt.grip, user_height=opt.user_height, devices=read
     )  # fmt: skip
-    reader = stream.Reader("standard input" if opt.stream == "-" else opt.stream, strict=not live, devices=read)
-    samples = reader.read(stream.lines_of(opt.stream))
-    pace = stream.Pace(player.dt) if opt.realtime or opt.view else None
+    reader = Reader("standard input" if opt.stream == "-" else opt.stream, strict=not live, devices=read)
+    samples = reader.read(lines_of(opt.stream))
+    pace = Pace(player.dt) if opt.realtime or opt.view else None
     if live and pace:
-        samples = stream.arriving(samples, stream.GAP, player.dt)
+        samples = arriving(samples, GAP, player.dt)
     seen = []
     keep = PICTURED / player.dt if opt.png or opt.video else 0
     with contextlib.ExitStack() as stack:
@@ -608,7 +601,7 @@ def play_stream(char: Character, policy, path, devices: int, opt: Options) -> No
                 return handle.is_running()
 
         with contextlib.suppress(KeyboardInterrupt):  # the end of a live stream; what happened is still told
-            stream.drive(source, samples, player, opt.seconds, pace, see)
+            drive(source, samples, player, opt.seconds, pace, see)
     if source.calibration is None:
         raise UserError(f"{reader.name}: {source.uncalibrated()}")
     unreadable = [f"{reader.unreadable} lines could not be read"] if reader.unreadable else []
@@ -620,17 +613,17 @@ def play_stream(char: Character, policy, path, devices: int, opt: Options) -> No
 
 
 def _write_pictures(char, ref, recording, last, opt):
-    """The contact sheet and the video that the options ask for.  Test: tests/test_cli.py::test_play_png"""
-    import render
+    """The contact sheet and the video that the options ask for.  Test: tests/robustness/test_cli.py::test_play_png"""
+    from plumbing import render
 
     if opt.png:
-        frames = np.arange(0, last + 1, max(1, round((opt.every or 0.5) * mocap.CONTROL_RATE)))
-        labels = [f"{t / mocap.CONTROL_RATE:.1f} s" for t in frames]
+        frames = np.arange(0, last + 1, max(1, round((opt.every or 0.5) * CONTROL_RATE)))
+        labels = [f"{t / CONTROL_RATE:.1f} s" for t in frames]
         render.write_png(opt.png, render.contact_sheet(pictures(char, ref, recording, frames), labels, 5))
         print(opt.png)
     if opt.video:
         images = pictures(char, ref, recording, range(last + 1), (640, 480), fast=True)
-        render.write_video(opt.video, images, mocap.CONTROL_RATE)
+        render.write_video(opt.video, images, CONTROL_RATE)
         print(opt.video)
 
 
@@ -643,7 +636,7 @@ def find_policy(opt: Options):
     shipped = name.with_suffix(".npz") if name.suffix == ".toml" else character.CHARACTERS / f"{name}.npz"
     path = Path(opt.policy) if opt.policy else shipped
     if not path.exists():
-        character.load(str(name))  # a wrong name, or a broken character, is the better complaint
+        load(str(name))  # a wrong name, or a broken character, is the better complaint
         make = f"python ppo.py --character {name} --out runs/a"
         raise UserError(f"no policy {path}: train one ({make}), then --policy runs/a")
     policy, meta = load_policy(path)
@@ -655,9 +648,9 @@ def load_character(opt: Options, meta, path) -> Character:
 
     A flag changes that one thing; another character has none of the policy's variations.
     Test      tests/test_play.py::test_character_of_the_policy"""
-    own = trained_as(meta, path) or character.Switches()
-    base = own if opt.character in (None, own.character) else character.Switches(opt.character)
-    given = {k: v for k in ("tail", "scale", "set") if (v := getattr(opt, k)) != getattr(character.Switches(), k)}
+    own = trained_as(meta, path) or Switches()
+    base = own if opt.character in (None, own.character) else Switches(opt.character)
+    given = {k: v for k in ("tail", "scale", "set") if (v := getattr(opt, k)) != getattr(Switches(), k)}
     return replace(base, **given).load()
 
 
@@ -677,7 +670,7 @@ def shown_to(meta, path, ref: Reference, sensors: str | None) -> Reference:
     Test      tests/test_play.py::test_headset_only"""
     if devices_of(meta, path, sensors) == 1:
         return headset_only(ref)
-    return stream.controllers_hang(ref) if sensors == "hmd" else ref
+    return controllers_hang(ref) if sensors == "hmd" else ref
 
 
 def main(argv=None):
@@ -711,7 +704,7 @@ def main(argv=None):
     if opt.stream and opt.measure:
         raise UserError("--measure compares with a human's motion, which a stream has not; give one of the two")
     push = parse_push(opt.push)
-    check_folders(opt.json, opt.png, opt.video, opt.bvh, read=(*mocap.parts(opt.motion), opt.stream, opt.policy))
+    check_folders(opt.json, opt.png, opt.video, opt.bvh, read=(*mocap.data.parts(opt.motion), opt.stream, opt.policy))
     if opt.json and not (opt.measure or opt.compare):
         raise UserError("--json writes the table of --measure or --compare: give one of them")
     if not opt.compare:
@@ -720,11 +713,11 @@ def main(argv=None):
     if opt.stream:
         play_stream(char, policy, path, devices_of(meta, path, opt.sensors), opt)
         return
-    clips = mocap.sequences(
+    clips = mocap.data.sequences(
         opt.motion, "all" if opt.all else opt.split, opt.clips, seed=opt.seed, reading=Reading.of(opt)
     )
     if opt.user_scale != 1.0:
-        clips = [mocap.resize(c, opt.user_scale) for c in clips]
+        clips = [augment.resize(c, opt.user_scale) for c in clips]
     if opt.sequence >= len(clips):
         raise UserError(f"--sequence {opt.sequence}: there are {len(clips)}, from 0")
     if opt.compare:
@@ -735,7 +728,7 @@ def main(argv=None):
         if opt.json:
             atomic_write(opt.json, as_json(results))
         if opt.png:
-            import render
+            from plumbing import render
 
             render.write_png(opt.png, comparison_sheet(arms, clips[opt.sequence], opt))
             print(opt.png)
@@ -755,19 +748,19 @@ def main(argv=None):
         if opt.json:
             atomic_write(opt.json, as_json(results))
     if opt.png or opt.video or opt.bvh:
-        last = int((opt.seconds or 10.0) * mocap.CONTROL_RATE) if opt.png or opt.video else EPISODE_STEPS
-        shown = min(last, EPISODE_STEPS, int(ref.last[opt.sequence] - ref.first[opt.sequence])) / mocap.CONTROL_RATE
+        last = int((opt.seconds or 10.0) * CONTROL_RATE) if opt.png or opt.video else EPISODE_STEPS
+        shown = min(last, EPISODE_STEPS, int(ref.last[opt.sequence] - ref.first[opt.sequence])) / CONTROL_RATE
         if push and push.at >= shown:
             says = f"only {shown:.1f} s are shown: push earlier, or give more --seconds"
             raise UserError(f"--push {opt.push}: {says}")
         recording = simulate(char, seen, policy_action(policy), threads=opt.threads, only=[opt.sequence], push=push)[0]
-        lived = (len(recording.frames) - 1) / mocap.CONTROL_RATE
+        lived = (len(recording.frames) - 1) / CONTROL_RATE
         print(
-            f"{ref.names[opt.sequence]}: lived {lived:.1f} s of {recording.available / mocap.CONTROL_RATE:.1f}"
+            f"{ref.names[opt.sequence]}: lived {lived:.1f} s of {recording.available / CONTROL_RATE:.1f}"
             + (f"; pushed by {push.newtons:g} N at {push.at:g} s" if push and push.at < lived else "")
         )
         if opt.bvh:
-            retarget.write_bvh(opt.bvh, char, recording.qpos, mocap.CONTROL_RATE)
+            retarget.write_bvh(opt.bvh, char, recording.qpos, CONTROL_RATE)
             print(opt.bvh)
         _write_pictures(char, seen, recording, min(last, len(recording.frames) - 1), opt)
     if opt.view:

@@ -31,11 +31,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 import character
-import gpu
-import mocap
+import mocap.augment
+import mocap.data
 import retarget
 from env import EPISODE_STEPS, SENSORS, TRACK, WITHOUT, Disturbance, Env, ablated, headset_only, input_names
-from gym_env import Task, character_only, with_defaults_of_cleanrl
+from extras.gpu import arrays_of, fetched, moved
+from extras.gym_env import Task, character_only, with_defaults_of_cleanrl
+from mocap.data import MOTION, sequences
+from mocap.rigs import HELP, Reading
 from nn import (
     ACTIVATIONS,
     MLP,
@@ -49,32 +52,33 @@ from nn import (
     value_loss,
     widened,
 )
-from rigs import HELP, Reading
-from runs import (
+from plumbing.cli import (
     ALL_POSITIVE,
-    CHECKPOINT,
     COUNT,
-    METRICS,
     NONNEGATIVE,
     POSITIVE,
     THREADS,
     UNIT,
+    UserError,
+    arg,
+    cli,
+    given_flags,
+    run_main,
+)
+from plumbing.runs import (
+    CHECKPOINT,
+    METRICS,
     Metrics,
     Progress,
     StopFlag,
-    UserError,
-    arg,
     check_run,
-    cli,
     fmt_count,
     git_state,
-    given_flags,
     latest_checkpoint,
     load_checkpoint,
     open_run,
     rng_from_state,
     rng_state,
-    run_main,
     save_checkpoint,
     stored_options,
     versions,
@@ -93,7 +97,7 @@ class Options(character.Switches):
     Table 3 of the paper (its hyper-parameters) is not in the text we work from: these are ASSUMED, from measured runs.
     """
 
-    motion: str = arg("builtin", mocap.MOTION)
+    motion: str = arg("builtin", MOTION)
     clips: str = arg("*", "shell pattern on clip names, such as '*walk*'")
     joint_map: str | None = arg(None, HELP["joint_map"])
     unit: str | None = arg(None, HELP["unit"])
@@ -524,8 +528,8 @@ def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
         motion, _, _, _ = str(meta["options"]["motion"]), meta["options"]["init"], meta["steps"], meta["data"]
     except (KeyError, TypeError) as e:
         raise UserError(f"{run}: does not say how it was trained ({e}); valid: a folder that ppo.py wrote") from None
-    sets = mocap.parts(motion)
-    licences = [f"weights trained on {text}" for text in mocap.licences(sets)]
+    sets = mocap.data.parts(motion)
+    licences = [f"weights trained on {text}" for text in mocap.data.licences(sets)]
     if "licence" in meta:  # was shipped before
         licences = [str(meta["licence"])] if meta["licence"] != "MIT" else []
     kept = {"policy": meta["policy"], "steps": total_steps(meta), "data": meta["data"]}
@@ -759,7 +763,7 @@ class Trainer:
         """Everything: policy, optimisers, environments, random states."""
         own = dict(steps=self.steps, updates=self.updates, lr=self.adam_pi.lr, policy=self.policy.shape())
         if self.opt.gpu:  # the policy alone: --init goes on from it
-            save_checkpoint(path, gpu.fetched(self.policy.arrays()), meta | own)
+            save_checkpoint(path, fetched(self.policy.arrays()), meta | own)
             return
         arrays, rest = self.policy.arrays(), dict(rng=[rng_state(r) for r in self.rngs], env=[])
         for k, env in enumerate(self.envs):
@@ -826,7 +830,7 @@ def environments(char, ref, opt: Options) -> list[Env]:
 def make_envs(opt: Options) -> list[Env] | list[Task]:
     """Character, stitched training sequences, augmented if asked for, environments.  Or Gymnasium's task.
 
-    Test      tests/test_ppo.py::test_make_envs_augments, tests/test_gym_env.py::test_wrong_tasks
+    Test      tests/test_ppo.py::test_make_envs_augments, tests/extras/test_gym_env.py::test_wrong_tasks
     """
     if opt.gym:
         character_only(opt, Options())
@@ -834,9 +838,9 @@ def make_envs(opt: Options) -> list[Env] | list[Task]:
     if opt.reward_norm or opt.limit_ends:
         raise UserError("--reward-norm and --limit-ends are of tasks: give --gym, or leave them out")
     char = ablated(opt.load(), opt.without, opt.track).solved_by(opt.solver)
-    clips = mocap.sequences(opt.motion, "train", opt.clips, seed=opt.seed, reading=Reading.of(opt))
+    clips = sequences(opt.motion, "train", opt.clips, seed=opt.seed, reading=Reading.of(opt))
     if opt.augment:
-        clips = mocap.augment(clips, np.random.default_rng([opt.seed, 3]))
+        clips = mocap.augment.augment(clips, np.random.default_rng([opt.seed, 3]))
     ref = retarget.reference(char, clips)
     return environments(char, headset_only(ref) if opt.sensors == "hmd" else ref, opt)
 
@@ -934,7 +938,9 @@ def resumed_options(opt: Options, argv) -> Options:
 
 
 def train(opt: Options) -> Trainer:
-    """Run, or resume, a training run.  Test: tests/test_ppo.py::test_resume_is_exact, tests/test_cli.py::test_ppo"""
+    """Run, or resume, a training run.
+
+    Test      tests/test_ppo.py::test_resume_is_exact, tests/robustness/test_cli.py::test_ppo"""
     out = Path(opt.out)
     if opt.gpu and (opt.gym or opt.resume):
         raise UserError("--gpu trains a character, and goes on with --init: leave --gym and --resume out")
@@ -961,7 +967,7 @@ def train(opt: Options) -> Trainer:
         )
     with ExitStack() as stack:
         if opt.gpu:
-            stack.enter_context(gpu.arrays_of(gpu.moved(trainer)))
+            stack.enter_context(arrays_of(moved(trainer)))
         _loop(trainer, loaded, {"options": asdict(opt), "data": data, "before": before}, time.perf_counter() - began)
     return trainer
 
@@ -1028,7 +1034,7 @@ def progress_line(s) -> dict:
 
 
 def main(argv=None):
-    """python ppo.py: train, or resume.  Test: tests/test_cli.py::test_ppo"""
+    """python ppo.py: train, or resume.  Test: tests/robustness/test_cli.py::test_ppo"""
     of_gym = any(a.split("=")[0] == "--gym" for a in argv)
     opt = cli(with_defaults_of_cleanrl(Options) if of_gym else Options, argv, "ppo.py", __doc__)
     opt, given = replace(opt, out=opt.out or f"runs/{Path(opt.gym or opt.character).stem}"), given_flags(argv)

@@ -18,15 +18,18 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-import bvh
 import character
-import mocap
+import mocap.data
 from character import Character, geom_lowest
-from mocap import (
+from human import (
+    FEET,
+    PARENTS,
     SEG,
     Clip,
     angular_velocity,
+    contacts,
     heading,
+    headset_height,
     linear_velocity,
     quat_about,
     quat_conj,
@@ -34,9 +37,13 @@ from mocap import (
     quat_matrix,
     quat_mul,
     quat_rotate,
+    sensors,
 )
-from rigs import HELP, Reading
-from runs import UserError, arg, check_folders, cli, run_main
+from mocap.bvh import BvhError, write
+from mocap.data import MOTION, load
+from mocap.rigs import HELP, Reading
+from plumbing.cli import UserError, arg, cli, run_main
+from plumbing.files import check_folders
 
 STAGE_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 
@@ -143,22 +150,28 @@ def root_scale(char: Character, hip_height: float) -> np.ndarray:
 def headset(char: Character) -> np.ndarray:
     """Where the character's headset is when it stands at the origin in its default pose.  (3,) [m]
 
-    Test      tests/test_stream.py::test_stand"""
+    Test      tests/headset/test_stream.py::test_stand"""
     data = mujoco.MjData(char.model)
     data.qpos[2], data.qpos[7:] = char.hip_height, char.default
     mujoco.mj_kinematics(char.model, data)
     return data.site_xpos[char.sensor_sites[0]].copy()
 
 
-def standing(char: Character, offset, pos, quat) -> np.ndarray:
+# From a standing human's hips to the headset, in the heading frame [m]: Bandai's actor and the built-in human, rounded
+HEADSET_AHEAD = np.array([0.14, 0.0, 0.0])
+
+
+def standing(char: Character, pos, quat) -> np.ndarray:
     """The default pose under headsets, turned as they look, feet on the floor: where a stream begins.
 
-    Args      offset : `headset` of the character; pos (N, 3) [m], quat (N, 4) of headsets, world
+    ASSUMED   the root stands where the user's hips are, HEADSET_AHEAD behind the headset, as in training (§3.4: travel
+              is not scaled), and not where the character's own headset would be under the user's: Dino's is 0.38 m ahead
+    Args      pos (N, 3) [m], quat (N, 4) of headsets, world
     Returns   qpos (N, 7 + j)
-    Test      tests/test_stream.py::test_stand, tests/test_env.py::test_standing_starts
+    Test      tests/headset/test_stream.py::test_stand, tests/test_env.py::test_standing_starts
     """
     turn = quat_about(2, heading(quat))
-    place = pos - quat_rotate(turn, offset)
+    place = pos - quat_rotate(turn, HEADSET_AHEAD)
     root = quat_mul(turn, char.rest[char.root])
     n = len(pos)
     height, pose = np.full((n, 1), char.hip_height), np.broadcast_to(char.default, (n, len(char.default)))
@@ -173,8 +186,10 @@ def sensor_scale(char: Character, hip_height: float, headset_height: float) -> n
               user can be measured by, and a user of any build then wears the headset at the character's head.  With
               `[sensors] scale_z = "hip"` they go through `root_scale`: a CMU subject's headset is then 11 to 20 cm
               above Jesse's head, Oppy's user's 25 cm below Oppy's eyes
-    Args      hip_height, headset_height : of the user [m]; of a clip's, or of a stream's (`stream.calibrate`)
-    Test      tests/test_retarget.py::test_sensor_scale, tests/test_stream.py::test_calibration_scales_as_training
+    Args      hip_height, headset_height : of the user [m]; of a clip's, or of a stream's
+              (`headset.calibration.calibrate`)
+    Test      tests/test_retarget.py::test_sensor_scale,
+              tests/headset/test_stream.py::test_calibration_scales_as_training
     """
     scale, z = root_scale(char, hip_height), char.spec["sensors"].get("scale_z", "headset")
     if z != "hip":
@@ -294,6 +309,7 @@ class Reference:
     scale: np.ndarray  # (F, 3) float32, by which the human's positions were multiplied
     sensor_scale: np.ndarray  # (F, 3) float32, by which the devices' were
     human_rot: np.ndarray  # (F, 15, 3, 2) float32
+    still: np.ndarray  # (S,) frames at each sequence's beginning in which the user stands still
 
     def __len__(self):
         return len(self.qpos)
@@ -313,15 +329,16 @@ def reference(char: Character, clips: list[Clip]) -> Reference:
     first = np.concatenate([[0], np.cumsum(lengths)[:-1]])
     # a frame's numbers side by side in memory, because the environment gathers frames
     joined = {k: np.ascontiguousarray(np.concatenate([r[k] for r in rows])) for k in rows[0]}
-    return Reference([c.name for c in clips], rates.pop(), first, first + lengths - 1, **joined)
+    still = np.array([c.still for c in clips])
+    return Reference([c.name for c in clips], rates.pop(), first, first + lengths - 1, **joined, still=still)
 
 
 def _reference_of(char, clip):
     pose = retarget(char, clip)
     fk = forward_kinematics(char, pose.qpos, pose.qvel)
     scale = root_scale(char, clip.hip_height)
-    size = sensor_scale(char, clip.hip_height, mocap.headset_height(clip))
-    sensor_pos, sensor_quat = mocap.sensors(clip)
+    size = sensor_scale(char, clip.hip_height, clip.measured or headset_height(clip))
+    sensor_pos, sensor_quat = sensors(clip)
     f32 = np.float32
     return dict(
         qpos=pose.qpos,
@@ -329,7 +346,7 @@ def _reference_of(char, clip):
         link_pos=fk.xpos[:, char.reward_links].astype(f32),
         link_vel=fk.velocity[:, char.reward_links].astype(f32),
         orientation=rest_offset(char, clip.quat[:, [SEG["pelvis"], SEG["head"]]]),
-        contact=mocap.contacts(clip),
+        contact=contacts(clip),
         sensor_pos=sensor_pos * size,
         sensor_rot=quat_matrix(sensor_quat)[..., :2].astype(f32),
         sensor_quat=sensor_quat,
@@ -366,7 +383,7 @@ def artefacts(char: Character, clip: Clip, pose: Pose) -> dict:
     Test      tests/test_retarget.py::test_artefacts
     """
     height, speed = sole_motion(forward_kinematics(char, pose.qpos).soles, clip.rate)
-    contact = mocap.contacts(clip)
+    contact = contacts(clip)
     lowest = height.min(axis=1)
     share = pose.clipped.mean(axis=0)
     worst = sorted(zip(char.hinges, share, strict=True), key=lambda x: -x[1])
@@ -413,10 +430,10 @@ def write_bvh(path, char: Character, qpos, rate) -> None:
     leaves = {n: 200.0 * to_file(m.body_ipos[b]) for n, b in zip(names, bodies) if b not in m.body_parentid[bodies]}
     root, offsets = 100.0 * to_file(fk.xpos[:, char.root]), 100.0 * to_file(offsets)
     try:
-        bvh.write(path, names, parents, offsets, 1.0 / rate, root, local, leaves)
+        write(path, names, parents, offsets, 1.0 / rate, root, local, leaves)
     except OSError as e:
         raise UserError(f"cannot write {path}: {e.strerror or e}; give a folder that exists and is writable") from None
-    except bvh.BvhError as e:
+    except BvhError as e:
         raise UserError(str(e)) from None
 
 
@@ -428,7 +445,7 @@ class Options(character.Switches):
     """What `python retarget.py` can be told."""
 
     check: str | None = arg(None, "name every part that a character lacks: path of its .xml or .toml")
-    motion: str = arg("builtin", mocap.MOTION)
+    motion: str = arg("builtin", MOTION)
     clips: str = arg("*", "shell pattern on clip names")
     joint_map: str | None = arg(None, HELP["joint_map"])
     unit: str | None = arg(None, HELP["unit"])
@@ -444,7 +461,7 @@ def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360), camer
 
     Args      beside : (3,) [m] from the character to the human, world, instead of its left
     Test      tests/test_retarget.py::test_draw"""
-    import render
+    from plumbing import render
 
     shown = char.mjspec().compile()
     scene, apart = render.Scene(shown, *size, camera=camera), 0.2 + 0.9 * char.hip_height  # m
@@ -456,7 +473,7 @@ def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360), camer
         left = quat_rotate(clip.quat[t, 0], np.array([0.0, 1.0, 0.0])) * [1, 1, 0]
         side = apart * left / max(np.linalg.norm(left), 1e-9)
         points = np.concatenate([clip.pos[t], clip.ball[t]]) + (side if beside is None else beside)
-        bones = list(mocap.PARENTS) + list(mocap.FEET)
+        bones = list(PARENTS) + list(FEET)
         images.append(scene.frame(data, markers=render.stick_figure(points, bones)))
     return images
 
@@ -484,9 +501,9 @@ def main(argv=None):
     opt = cli(Options, argv, "retarget.py", __doc__)
     if opt.check:
         return report(opt.check)
-    check_folders(opt.bvh, opt.png, opt.video, read=mocap.parts(opt.motion))
+    check_folders(opt.bvh, opt.png, opt.video, read=mocap.data.parts(opt.motion))
     char = opt.load()
-    clips = mocap.load(opt.motion, clips=opt.clips, reading=Reading.of(opt))
+    clips = load(opt.motion, clips=opt.clips, reading=Reading.of(opt))
     print(
         f"{char.name}: hips {char.hip_height:.3f} m, {char.j} hinges, {len(char.limits)} driven, "
         f"{char.model.body_subtreemass[0]:.1f} kg"
@@ -515,7 +532,7 @@ def main(argv=None):
         write_bvh(opt.bvh, char, pose.qpos, clip.rate)
         print(opt.bvh)
     if opt.png or opt.video:
-        import render
+        from plumbing import render
 
         if opt.png:
             frames = np.linspace(0, len(clip) - 1, 12).astype(int)

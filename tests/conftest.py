@@ -9,9 +9,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
+sys.path += [str(folder) for folder in sorted((ROOT / "tests").iterdir()) if folder.is_dir()]  # helpers of other tests
 
 if "MUJOCO_GL" not in os.environ and "DISPLAY" not in os.environ:
-    import render
+    from plumbing import render
 
     name = render.gl_backend()
     if name:
@@ -32,10 +33,10 @@ def mocap_dir():
 @pytest.fixture(scope="module")
 def motions_once():
     """The built-in motions are made once a module, not for every run."""
-    import mocap
+    from mocap import data
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mocap, "builtin_clips", functools.cache(mocap.builtin_clips))
+        patch.setattr(data, "builtin_clips", functools.cache(data.builtin_clips))
         yield
 
 
@@ -50,7 +51,7 @@ def char():
 @pytest.fixture(scope="module")
 def ref(char):
     """Two seconds each of a few built-in motions, retargeted."""
-    import mocap
     import retarget
+    from mocap import data
 
-    return retarget.reference(char, [c[:60] for c in mocap.load("builtin", clips="*_00[57]")])
+    return retarget.reference(char, [c[:60] for c in data.load("builtin", clips="*_00[57]")])

@@ -15,10 +15,9 @@ import character
 import metrics
 import play
 import retarget
-import runs
 from character import CHARACTERS
 from env import Env
-from runs import UserError, run_main
+from plumbing.cli import UserError, arg, cli, run_main
 
 NAMES = ("jesse", "oppy", "dino")
 TABLE2 = {  # [Reda23 App. A]: w, k; a weight of 0 is printed without a k
@@ -157,7 +156,7 @@ def test_parts_are_what_they_are_called(chars, name):
         d.qpos[2], d.qpos[7:] = c.hip_height, c.default
         d.qpos[3:7] = Rotation.from_rotvec([lean, 0, 0]).as_quat(scalar_first=True)
         mujoco.mj_kinematics(m, d)
-        d.qpos[2] -= retarget.geom_lowest(m, c.sole_geoms[foot], d.geom_xpos[None], d.geom_xmat[None]).min() + 2e-3
+        d.qpos[2] -= character.geom_lowest(m, c.sole_geoms[foot], d.geom_xpos[None], d.geom_xmat[None]).min() + 2e-3
         mujoco.mj_forward(m, d)
         assert list(np.abs(d.sensordata[c.contact_adr]) > 1.0) == [foot == 0, foot == 1]
         _, left, right = d.site_xpos[c.sensor_sites]
@@ -448,17 +447,17 @@ def test_switches():
 
     @dataclasses.dataclass
     class Options(character.Switches):
-        more: int = runs.arg(1, "another flag")
+        more: int = arg(1, "another flag")
 
     flags = ["--character", "dino", "--tail", "passive", "--scale", "0.5"]
     flags += ["--set", "reward.contact=[0, 1]; pose.spine_y=0.3"]
-    c = runs.cli(Options, flags, "x", "").load()
+    c = cli(Options, flags, "x", "").load()
     assert c.variant == {"tail": "passive", "scale": 0.5, "set": ["reward.contact=[0, 1]", "pose.spine_y=0.3"]}
     assert c.reward["contact"] == (0.0, 1.0) and c.default[c.hinges.index("spine1_y")] == 0.3
-    assert runs.cli(Options, [], "x", "").load().variant == {}
+    assert cli(Options, [], "x", "").load().variant == {}
     for bad in (["--tail", "wag"], ["--scale", "0"], ["--scale", "-1"]):
         with pytest.raises(SystemExit):
-            runs.cli(Options, bad, "x", "")
+            cli(Options, bad, "x", "")
 
 
 # ----------------------------------------------------------------------------------------- complaints

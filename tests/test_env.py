@@ -9,15 +9,36 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import character
-import env as envs
-import gait
-import mocap
 import retarget
 from character import TERMS
-from env import Disturbance, Env, HeadingFrame
-from mocap import Clip
+from env import (
+    FORCE_LIMIT,
+    WITHOUT,
+    Disturbance,
+    Env,
+    HeadingFrame,
+    ablated,
+    fallen,
+    headset_only,
+    input_names,
+    kernel,
+    observation_terms,
+    reward_action_diff,
+    reward_action_min,
+    reward_contact,
+    reward_orientation,
+    reward_q,
+    reward_qd,
+    reward_x,
+    reward_xd,
+    too_far,
+    total_reward,
+    weighted_distance,
+)
+from human import Clip, place, resample
+from mocap import data, gait
+from plumbing.cli import UserError
 from retarget import STAGE_VEL
-from runs import UserError
 
 N = 8
 IMITATION = ("q", "qd", "x", "xd", "orientation")
@@ -134,7 +155,7 @@ def test_observation_terms(shared, ref, rng):
                 np.testing.assert_allclose(found, value, rtol=1e-5, atol=2e-5, err_msg=f"{name} of {i}")
     j, links = 33, 7
     sizes = dict(q=j, qd=6 + j, x=3 * links, R=6 * links, user_previous=27, user=27)
-    assert env.terms["actor"] == sizes == envs.observation_terms(shared)["actor"]
+    assert env.terms["actor"] == sizes == observation_terms(shared)["actor"]
     assert env.obs_size == sum(sizes.values()) == 189 and env.action_size == 33
     assert env.critic_size == 189 + 15 * 3 + 15 * 6 + 3 * 15 * 3 == env.full.shape[1]
     # The difference of the two user parts is how far the devices went: o_{t-1} is in the frame of t.
@@ -148,7 +169,7 @@ def test_observation_terms(shared, ref, rng):
 def test_heading_invariance(char, clips, ref, rng, pitch):
     """The whole world turned and shifted: same observation, same reward."""
     yaw, shift = rng.uniform(-3, 3), rng.uniform(-50, 50, 2)
-    there = retarget.reference(char, [mocap.place(c, yaw, (0, 0), shift) for c in clips])
+    there = retarget.reference(char, [place(c, yaw, (0, 0), shift) for c in clips])
     a, b = Env(char, ref, N, seed=1), Env(char, there, N, seed=1)
     a.reset(), b.reset()
     np.testing.assert_array_equal(a.frame, b.frame)
@@ -175,7 +196,7 @@ def test_heading_invariance(char, clips, ref, rng, pitch):
 
 def test_headset_only(shared, ref, rng):
     """§4.2: the observation without the controllers' numbers, and nothing else is different."""
-    less = envs.headset_only(ref)
+    less = headset_only(ref)
     assert less.sensor_pos.shape == (len(ref), 1, 3) and ref.sensor_pos.shape == (len(ref), 3, 3)
     for asymmetric in (True, False):
         a, b = (Env(shared, r, N, seed=1, asymmetric=asymmetric) for r in (ref, less))
@@ -184,8 +205,8 @@ def test_headset_only(shared, ref, rng):
             action = 0.2 * rng.standard_normal((N, 33))
             out_a, out_b = a.step(action), b.step(action)
             np.testing.assert_array_equal(out_a[1], out_b[1])
-        names = envs.input_names(shared, 3, asymmetric)
-        keep = [names.index(n) for n in envs.input_names(shared, 1, asymmetric)]
+        names = input_names(shared, 3, asymmetric)
+        keep = [names.index(n) for n in input_names(shared, 1, asymmetric)]
         assert b.obs_size == a.obs_size - 2 * 18 and b.full.shape[1] == a.full.shape[1] - 36 == len(keep)
         np.testing.assert_array_equal(b.full, a.full[:, keep])
         np.testing.assert_array_equal(b.full[:, : b.obs_size], a.full[:, keep[: b.obs_size]])
@@ -206,7 +227,7 @@ def test_input_names(shared, ref):
     """Each name where the observation has that number: looked up in MuJoCo's own arrays."""
     env = Env(shared, ref, 2, seed=1)
     env.reset()
-    names, m = envs.input_names(shared), shared.model
+    names, m = input_names(shared), shared.model
     assert len(names) == len(set(names)) == env.full.shape[1]
     at = lambda name: env.full[:, names.index(name)]  # noqa: E731
     for hinge in ("knee_l_y", "hip_r_z"):
@@ -217,7 +238,7 @@ def test_input_names(shared, ref):
         np.testing.assert_allclose(at(f"x.{body}.z"), env.xpos[:, m.body(body).id, 2], rtol=1e-5)
         np.testing.assert_allclose(at(f"R.{body}.R4"), env.xmat[:, m.body(body).id, 6], atol=1e-5)  # row 2, column 0
     np.testing.assert_allclose(at("user.r.z"), ref.sensor_pos[env.frame, 2, 2], rtol=1e-5)
-    assert set(envs.input_names(shared, 1)) < set(names) and "human_pos_in_15.44" in names
+    assert set(input_names(shared, 1)) < set(names) and "human_pos_in_15.44" in names
 
 
 def test_symmetric_critic(shared, ref, rng):
@@ -268,16 +289,16 @@ def test_reward_terms(char, ref, rng):
         d_diff = sum((q2[n, i] - q[n, i]) ** 2 for i in range(33)) / 33
         d_min = sum(q[n, i] ** 2 for i in range(33)) / 33
         for found, d in (
-            (envs.reward_q(w, k, q, q2, weights), d_q), (envs.reward_qd(w, k, q, q2, weights), d_q),
-            (envs.reward_x(w, k, x, x2, wl), d_x), (envs.reward_xd(w, k, x, x2, wl), d_x),
-            (envs.reward_orientation(w, k, quat, quat2), d_o), (envs.reward_orientation(w, k, -quat, quat2), d_o),
-            (envs.reward_contact(w, k, c, c2), d_c),
-            (envs.reward_action_diff(w, k, q2, q), d_diff), (envs.reward_action_min(w, k, q), d_min),
+            (reward_q(w, k, q, q2, weights), d_q), (reward_qd(w, k, q, q2, weights), d_q),
+            (reward_x(w, k, x, x2, wl), d_x), (reward_xd(w, k, x, x2, wl), d_x),
+            (reward_orientation(w, k, quat, quat2), d_o), (reward_orientation(w, k, -quat, quat2), d_o),
+            (reward_contact(w, k, c, c2), d_c),
+            (reward_action_diff(w, k, q2, q), d_diff), (reward_action_min(w, k, q), d_min),
         ):  # fmt: skip
             assert found.shape == (3,) and found[n] == pytest.approx(w * math.exp(-k * d), rel=1e-9)
-        assert envs.weighted_distance(q, q2, weights)[n] == pytest.approx(d_q)
-        assert envs.weighted_distance(x, x2, wl)[n] == pytest.approx(d_x)
-        assert envs.kernel(w, k, np.array([d_q]))[0] == pytest.approx(w * math.exp(-k * d_q))
+        assert weighted_distance(q, q2, weights)[n] == pytest.approx(d_q)
+        assert weighted_distance(x, x2, wl)[n] == pytest.approx(d_x)
+        assert kernel(w, k, np.array([d_q]))[0] == pytest.approx(w * math.exp(-k * d_q))
 
     env = Env(char, ref, N, seed=5)
     env.reset()
@@ -314,7 +335,7 @@ def test_total_reward(rng):
     """Eqs. 5 to 7: imitation (five terms), contact, action (two)."""
     t = {name: rng.normal(size=4) for name in TERMS}
     imitation = sum(t[name] for name in IMITATION)
-    np.testing.assert_allclose(envs.total_reward(t), imitation + t["contact"] + (t["action_diff"] + t["action_min"]))
+    np.testing.assert_allclose(total_reward(t), imitation + t["contact"] + (t["action_diff"] + t["action_min"]))
     assert set(TERMS) == {*IMITATION, "contact", "action_diff", "action_min"}
 
 
@@ -338,23 +359,23 @@ def test_ablated(shared, char, clips, ref, rng):
     """§3.5.1, §4.3: exactly the terms named are gone; the others, and the character, stay."""
     names = {"contact": {"contact"}, "orientation": {"orientation"}, "action": {"action_diff", "action_min"}}
     names |= {"imitation": {"q", "qd", "x", "xd"}, "asymmetric": set()}
-    assert set(envs.WITHOUT) == set(names)
+    assert set(WITHOUT) == set(names)
     full = Env(char, ref, N, seed=2)
     full.reset()
     action = rng.uniform(-1, 1, (N, 33))
     _, reward, *_, info = full.step(action)
     for without in (*((n,) for n in names), ("contact", "imitation"), ("orientation", "action")):
         gone = set().union(*(names[n] for n in without))
-        less = envs.ablated(char, without)
+        less = ablated(char, without)
         assert {t for t in TERMS if less.reward[t][0] == 0.0} == gone
         assert all(less.reward[t] == char.reward[t] for t in TERMS if t not in gone)
         env = Env(less, ref, N, seed=2)
         env.reset()
         _, found, *_ = env.step(action)
         np.testing.assert_allclose(found, reward - sum(info["terms"][t] for t in gone), atol=1e-12)
-    assert char.reward["q"][0] > 0 and char.reward["fail"] == envs.ablated(char, ("action",)).reward["fail"]
+    assert char.reward["q"][0] > 0 and char.reward["fail"] == ablated(char, ("action",)).reward["fail"]
 
-    root = envs.ablated(char, track="root")
+    root = ablated(char, track="root")
     assert {t for t in TERMS if root.reward[t][0] == 0.0} == {"q", "qd", "xd"}
     env = Env(root, retarget.reference(root, clips), N, seed=2)
     env.reset()
@@ -365,10 +386,10 @@ def test_ablated(shared, char, clips, ref, rng):
         assert terms["orientation"][i] == pytest.approx(info["terms"]["orientation"][i])
     assert len(char.reward_links) == 6  # the argument is as it was
     with pytest.raises(UserError, match="no reward is left"):
-        envs.ablated(char, ["imitation", "orientation", "action", "contact"])
+        ablated(char, ["imitation", "orientation", "action", "contact"])
     for wrong in ({"without": ["gravity"]}, {"track": "head"}, {"without": ["imitation"], "track": "root"}):
         with pytest.raises(UserError, match="valid: contact, orientation, action|valid: all, root|no --without im"):
-            envs.ablated(char, **wrong)
+            ablated(char, **wrong)
 
 
 # ----------------------------------------------------------------------------------------- physics
@@ -453,7 +474,7 @@ def test_contact_forces(ref, rng):
     assert env._contact().all()
     assert np.abs(env.qvel).max() < 0.05
     normal = env.sensordata[:, statue.contact_adr]
-    assert np.all(normal > envs.FORCE_LIMIT)
+    assert np.all(normal > FORCE_LIMIT)
     np.testing.assert_allclose(normal.sum(axis=1), weight, rtol=0.02)
     for foot, name in enumerate(("contact_l", "contact_r")):
         assert statue.contact_adr[foot] == m.sensor(name).adr[0] + 2  # x, y, z: the third
@@ -564,7 +585,7 @@ def test_recorded_motion(char, mocap_dir):
     files = [*sorted(mocap_dir.rglob("*walk_normal_0*.bvh"))[:2], *sorted(mocap_dir.rglob("*afan1*.bvh"))[:1]]
     if not files:
         pytest.skip(f"{mocap_dir} holds no walk_normal and no LaFAN1 clip")
-    ref = retarget.reference(char, [mocap.resample(mocap.from_bvh(f), 30.0) for f in files])
+    ref = retarget.reference(char, [resample(data.from_bvh(f), 30.0) for f in files])
     env = check_reset(char, ref)
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -581,8 +602,8 @@ def test_termination(shared, ref):
     offset = rng.normal(size=(200, 3)) * 0.2
     want = [math.sqrt(x * x + y * y + z * z) > 0.30 for x, y, z in offset]
     target = rng.normal(size=(200, 3))
-    np.testing.assert_array_equal(envs.too_far(target + offset, target), want)
-    np.testing.assert_array_equal(envs.fallen(np.array([-0.1, 0.0, 1e-6])), [True, True, False])
+    np.testing.assert_array_equal(too_far(target + offset, target), want)
+    np.testing.assert_array_equal(fallen(np.array([-0.1, 0.0, 1e-6])), [True, True, False])
     assert 20 < sum(want) < 180
 
     env = Env(shared, ref, 6, horizon=3)
@@ -648,7 +669,7 @@ def test_any_upper_body_shape_falls(shared, ref):
     early = 0
     for _ in range(60):
         fell = env.step(np.zeros((32, 33)))[4]["ends"]["fall"]
-        low = retarget.geom_lowest(shared.model, shared.fall_geoms, env.geom_xpos, env.geom_xmat).min(1)
+        low = character.geom_lowest(shared.model, shared.fall_geoms, env.geom_xpos, env.geom_xmat).min(1)
         np.testing.assert_array_equal(fell, low <= 0)
         early += np.sum(fell & (env.xpos[:, shared.head, 2] > 0.2))
     assert early > 10
@@ -664,7 +685,7 @@ def test_fall_is_contact(shared, ref):
     env.qpos[:, 7:] = rng.uniform(shared.ranges[:, 0], shared.ranges[:, 1], (n, 33))
     env.qpos[:, 2] = rng.uniform(0.1, 0.9, n)
     env.batch.forward(None, STAGE_VEL)
-    found = envs.fallen(character.geom_lowest(m, shared.fall_geoms, env.geom_xpos, env.geom_xmat).min(1))
+    found = fallen(character.geom_lowest(m, shared.fall_geoms, env.geom_xpos, env.geom_xmat).min(1))
     legs = 0
     for i in range(n):
         d = fresh(env, i)
@@ -858,7 +879,7 @@ def test_state_continues_exactly(shared, ref):
 
 def test_balanced_starts(char):
     """Half of the time by frames, half by failures: against simulated episodes; seeded and resumed exactly."""
-    clips = [c[:n] for c, n in zip(mocap.builtin_clips(), (151, 121, 211), strict=False)]
+    clips = [c[:n] for c, n in zip(data.builtin_clips(), (151, 121, 211), strict=False)]
     ref = retarget.reference(char, clips)
     env = Env(char, ref, 6000, threads=1, horizon=100, balance=True)
     ids, frames = np.arange(env.n), np.array([149, 119, 209])
@@ -896,7 +917,7 @@ def test_balanced_starts(char):
 
 def test_standing_starts(char):
     """Under the headset, upright, moving as it does; not where the root would then be too far from the human's."""
-    ref = retarget.reference(char, [c for c in mocap.builtin_clips() if c.name in ("walk_005", "stand_007", "jog_009")])
+    ref = retarget.reference(char, [c for c in data.builtin_clips() if c.name in ("walk_005", "stand_007", "jog_009")])
     env = Env(char, ref, 400, threads=1, stand=1.0)
     env.reset(3)
     f, rest = env.frame, np.abs(env.qpos[:, 7:] - char.default).max(1) < 1e-12
@@ -908,7 +929,7 @@ def test_standing_starts(char):
     assert rest.any() and np.abs(low[rest]).max() < 1e-6
     speed = np.linalg.norm((ref.sensor_pos[f, 0] - ref.sensor_pos[f - 1, 0])[:, :2], axis=1) * ref.rate
     np.testing.assert_allclose(np.linalg.norm(env.qvel[rest], axis=1), speed[rest], atol=1e-9)
-    assert not envs.too_far(env.qpos[:, :3], ref.qpos[f, :3]).any()
+    assert not too_far(env.qpos[:, :3], ref.qpos[f, :3]).any()
     ref.qpos[:, 2] -= 0.4  # all crouch: none can start upright
     env.reset(3)
     np.testing.assert_array_equal(env.qpos, ref.qpos[env.frame])
@@ -924,7 +945,7 @@ def test_standing_starts(char):
 
 def test_retried_starts(char):
     """A share of the episodes starts 3 to 59 steps before a remembered failure, in its sequence; the rest anywhere."""
-    clips = [c[:n] for c, n in zip(mocap.builtin_clips(), (151, 121, 211), strict=False)]
+    clips = [c[:n] for c, n in zip(data.builtin_clips(), (151, 121, 211), strict=False)]
     ref = retarget.reference(char, clips)
     for balance in (False, True):
         env = Env(char, ref, 4000, threads=1, retry=0.4, balance=balance)

@@ -10,13 +10,14 @@ from test_mocap import walk
 
 import character
 import metrics
-import mocap
 import play
 import retarget
 from env import too_far
+from human import quat_about, quat_mul
 from metrics import Recording
+from mocap.data import load
+from plumbing.cli import UserError
 from retarget import forward_kinematics
-from runs import UserError
 
 KEYS = (  # spec: every key of every row
     "clips completed survival root_cm head_cm hands_cm joint_pos_cm head_deg joint_rot_deg sip_deg foot_slide_cm_s "
@@ -35,7 +36,7 @@ def char():
 
 @pytest.fixture(scope="module")
 def ref(char):
-    walk, stand = (mocap.load("builtin", clips=c)[0] for c in ("walk_005", "stand_007"))
+    walk, stand = (load("builtin", clips=c)[0] for c in ("walk_005", "stand_007"))
     return retarget.reference(char, [walk[:40], stand[:90], walk[60:90]])
 
 
@@ -269,7 +270,7 @@ def test_human_is_measured_before_the_scaling():
 
 def test_head_is_compared_with_the_humans(char, ref):
     still_ref, rec = still(char, ref)
-    nods = mocap.quat_mul(mocap.quat_about(1, 0.2), still_ref.orientation)  # the human does, the kinematic pose not
+    nods = quat_mul(quat_about(1, 0.2), still_ref.orientation)  # the human does, the kinematic pose not
     row = metrics.measure(char, replace(still_ref, orientation=nods), [rec])
     assert row["head_deg"] == pytest.approx(np.degrees(0.2))
 

@@ -8,14 +8,17 @@ import pytest
 
 import character
 import metrics
-import mocap
 import play
-import render
+import ppo
 import retarget
 from env import Env, headset_only
+from headset.reader import controllers_hang
+from human import heading
+from mocap import data
+from plumbing import render
+from plumbing.cli import UserError
+from plumbing.runs import save_checkpoint
 from ppo import Policy
-from runs import UserError, save_checkpoint
-from stream import controllers_hang
 
 COLUMNS = [key for key, *_ in metrics.COLUMNS]
 pytestmark = pytest.mark.usefixtures("motions_once")
@@ -28,13 +31,13 @@ def char():
 
 @pytest.fixture(scope="module")
 def ref(char):
-    walk, stand = (mocap.load("builtin", clips=c)[0] for c in ("walk_005", "stand_007"))
+    walk, stand = (data.load("builtin", clips=c)[0] for c in ("walk_005", "stand_007"))
     return retarget.reference(char, [walk[:40], stand[:90], walk[60:90]])
 
 
 @pytest.fixture(scope="module")
 def long(char):
-    return retarget.reference(char, mocap.load("builtin", clips="stand_007"))
+    return retarget.reference(char, data.load("builtin", clips="stand_007"))
 
 
 def cheat(env):
@@ -61,7 +64,7 @@ def test_push(char, ref):
     env.reset(frames=[1])
     env.qpos[:, 2] += 5.0  # in the air nothing else pushes
     env.qvel[:] = 0.0
-    yaw, xfrc, com = mocap.heading(env.qpos[0, 3:7]), env.batch.bind("xfrc_applied"), []
+    yaw, xfrc, com = heading(env.qpos[0, 3:7]), env.batch.bind("xfrc_applied"), []
     env.batch.forward(np.arange(1), retarget.STAGE_VEL)
     for _ in range(15):
         xfrc[:, char.root, :3] = push.force(env.steps * env.dt, yaw)
@@ -214,7 +217,7 @@ def policy_file(char, ref, tmp_path):
 
 
 def test_measure_json(policy_file, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: [mocap.load("builtin", clips="walk_005")[0][:70]])
+    monkeypatch.setattr(data, "sequences", lambda *_, **__: [data.load("builtin", clips="walk_005")[0][:70]])
     monkeypatch.setattr(play, "time_to_failure", functools.partial(play.time_to_failure, seconds=1.0))
     out = tmp_path / "table.json"
     args = ["--policy", str(policy_file), "--measure", "--json", str(out), "--threads", "1"]
@@ -239,7 +242,7 @@ def test_split_and_all(policy_file, monkeypatch):
         asked.append((motion, split, clips, seed))
         raise UserError("enough")
 
-    monkeypatch.setattr(mocap, "sequences", sequences)
+    monkeypatch.setattr(data, "sequences", sequences)
     for more in ([], ["--split", "train"], ["--split", "style"], ["--all"], ["--clips", "*walk*", "--seed", "3"]):
         with pytest.raises(UserError, match="enough"):
             play.main(["--measure", "--policy", str(policy_file), *more])
@@ -268,7 +271,7 @@ def test_which_policy(policy_file, tmp_path, monkeypatch, char, ref):
     other = Policy(7, 9, 2, (4,), (4,), 0.1, 1.0, np.random.default_rng(0))
     save_checkpoint(tmp_path / "other.npz", other.arrays(), {"policy": other.shape()})
     monkeypatch.undo()
-    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: mocap.load("builtin", clips="stand_007"))
+    monkeypatch.setattr(data, "sequences", lambda *_, **__: data.load("builtin", clips="stand_007"))
     with pytest.raises(UserError, match="other.npz: a policy of 7 observations and 2 actions; jesse needs"):
         play.main(["--measure", "--policy", str(tmp_path / "other.npz")])
 
@@ -336,7 +339,7 @@ def test_headset_only(char, ref, tmp_path):
     with pytest.raises(UserError, match="p: was trained with the headset alone"):
         play.shown_to(hmd, "p", ref, "full")
 
-    policy, _ = play.load_policy(save_policy(tmp_path / "hmd.npz", char, less, sensors="hmd"))
+    policy, _ = ppo.load_policy(save_policy(tmp_path / "hmd.npz", char, less, sensors="hmd"))
     opt = play.Options(random_starts=0, threads=1)
     seen = []
     act = lambda env: (seen.append(env.full.copy()), play.policy_action(policy)(env))[1]  # noqa: E731
@@ -355,8 +358,8 @@ def test_headset_only(char, ref, tmp_path):
 @pytest.fixture
 def two(tmp_path, monkeypatch):
     """Policies of two characters, one of them smaller and with the headset alone, and the clips they are shown."""
-    clips = [mocap.load("builtin", clips=c)[0][:45] for c in ("walk_005", "stand_007")]
-    monkeypatch.setattr(mocap, "sequences", lambda *_, **__: clips)
+    clips = [data.load("builtin", clips=c)[0][:45] for c in ("walk_005", "stand_007")]
+    monkeypatch.setattr(data, "sequences", lambda *_, **__: clips)
     out = []
     for name, options in (("jesse", {"sensors": "hmd", "without": ["contact"]}), ("oppy", {"scale": 0.8})):
         char = character.load(name, scale=options.get("scale", 1.0))
@@ -395,7 +398,7 @@ def test_comparison_sheet(two, tmp_path, monkeypatch):
     """A row of eight pictures for the human and for each policy, at the same moments; empty where one had failed."""
     if render.gl_backend() is None:
         pytest.skip("no OpenGL")
-    clips = mocap.sequences()
+    clips = data.sequences()
     opt = play.Options(compare=tuple(map(str, two)), threads=1)
     arms = play.arms_of(clips, opt)
     falls = lambda obs: np.ones((len(obs), arms[1].char.model.nu))  # noqa: E731

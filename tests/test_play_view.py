@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 import character
-import mocap
 import play
 import ppo
 import retarget
-from runs import UserError
+from mocap.data import sequences
+from plumbing.cli import UserError
 
 ROOT = Path(__file__).resolve().parent.parent
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -158,7 +158,7 @@ def test_browser_shows_the_character_moving(policy, tmp_path):
 def test_shown_model():
     """The shown model has the character's bodies and hinges in the same places, then one body for each sensor."""
     char = character.load("jesse")
-    clip = mocap.sequences("builtin", "validation")[0]
+    clip = sequences("builtin", "validation")[0]
     ref = retarget.reference(char, [clip])
     shown = play._shown_model(char, ref)
     names = [shown.body(i).name for i in range(shown.nbody)]

@@ -14,15 +14,17 @@ import pytest
 from scipy.stats import norm
 
 import character
-import env as envs
-import mocap
+import env
 import ppo
 import retarget
 from character import TERMS
 from env import Disturbance, Env, input_names
+from mocap import data
 from nn import check_gradient, gaussian_logp
+from plumbing import runs
+from plumbing.cli import UserError
+from plumbing.runs import CHECKPOINT, CONFIG, METRICS, load_checkpoint, read_config, read_metrics, save_checkpoint
 from ppo import Options, Policy, Trainer
-from runs import CHECKPOINT, CONFIG, METRICS, UserError, load_checkpoint, read_config, read_metrics, save_checkpoint
 
 ROOT = Path(__file__).resolve().parent.parent
 TIMES = ("steps_per_s", "collect_s", "update_s")
@@ -281,8 +283,8 @@ def test_bootstrap_is_before_the_reset(char, ref):
     t = trainer_of(char, ref, episode=3)
     twin = Env(char, ref, t.env.n, t.opt.seed, 1, 3)
     twin.reset(t.opt.seed)
-    for env in (t.env, twin):  # one character starts too far from its target, and fails in its first step
-        env.qpos[2, 0] += 1.0
+    for each in (t.env, twin):  # one character starts too far from its target, and fails in its first step
+        each.qpos[2, 0] += 1.0
     t.collect()
     value = lambda full: t.policy.value(t.policy.norm.normalise(full))  # noqa: E731
     terminated, truncated, moved = 0, 0, 0
@@ -653,7 +655,7 @@ def test_resume_after_sigkill(tmp_path):
     finally:
         process.kill()
         process.communicate()
-    meta = ppo.latest_checkpoint(out)[1]
+    meta = runs.latest_checkpoint(out)[1]
     assert meta["updates"] >= 4
     train(out, meta["updates"] + 2, "--resume")
     train(tmp_path / "whole", meta["updates"] + 2)
@@ -662,15 +664,15 @@ def test_resume_after_sigkill(tmp_path):
 
 def test_interrupt_ends_with_a_checkpoint(tmp_path, monkeypatch, capsys, whole):
     lines = itertools.count(1)
-    monkeypatch.setattr(ppo.Progress, "update", lambda *_: next(lines) == 2 and signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(runs.Progress, "update", lambda *_: next(lines) == 2 and signal.raise_signal(signal.SIGINT))
     _, meta = train(tmp_path / "a", 6)
     assert meta["updates"] == 2
     assert f"python ppo.py --resume --out {tmp_path / 'a'}" in capsys.readouterr().out
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    monkeypatch.setattr(ppo.Progress, "update", lambda *_: None)
+    monkeypatch.setattr(runs.Progress, "update", lambda *_: None)
     train(tmp_path / "a", 6, "--resume")
     assert_same_run(whole, tmp_path / "a")
-    monkeypatch.setattr(ppo.Progress, "update", lambda *_: [signal.raise_signal(signal.SIGTERM) for _ in range(2)])
+    monkeypatch.setattr(runs.Progress, "update", lambda *_: [signal.raise_signal(signal.SIGTERM) for _ in range(2)])
     with pytest.raises(KeyboardInterrupt):  # the second one: at once
         train(tmp_path / "b", 6)
 
@@ -684,8 +686,8 @@ def test_resume_refuses_other_options(whole, tmp_path, monkeypatch):
         train(tmp_path / "none", 6, "--resume")
     with pytest.raises(UserError, match="already holds a run"):
         train(whole, 6)
-    original = mocap.builtin_clips
-    monkeypatch.setattr(mocap, "builtin_clips", lambda rate, name: original(rate, seed=1))
+    original = data.builtin_clips
+    monkeypatch.setattr(data, "builtin_clips", lambda rate, name: original(rate, seed=1))
     with pytest.raises(UserError, match="motions have changed.*--init"):
         train(whole, 8, "--resume")
     assert before == {p: p.read_bytes() for p in whole.iterdir()}  # refused: untouched
@@ -858,12 +860,12 @@ def test_init_of_another_character(whole, tmp_path, capsys):
     assert "jesse's policy: 459 of 487 inputs and 33 of 37 torques" in capsys.readouterr().out
     assert meta["policy"]["action_size"] == 37
     jesse, dino = character.load("jesse"), character.load("dino")
-    clip = mocap.builtin_clips()[0][:40]
+    clip = data.builtin_clips()[0][:40]
     a, b = (Env(c, retarget.reference(c, [clip]), 3, threads=1) for c in (jesse, dino))
     new = ppo.initial_policy(whole, b, 0.07)
     np.testing.assert_allclose(new.log_std, np.log(0.07), rtol=1e-6)
     assert new.norm.count == 0
-    names = [envs.input_names(c) for c in (jesse, dino)]
+    names = [env.input_names(c) for c in (jesse, dino)]
     assert [len(n) for n in names] == [a.full.shape[1], b.full.shape[1]]
     x = np.random.default_rng(0).normal(size=(5, len(names[0]))).astype(np.float32)
     y = np.random.default_rng(1).normal(size=(5, len(names[1]))).astype(np.float32)  # what is new can be anything
@@ -880,7 +882,7 @@ def test_init_of_another_character(whole, tmp_path, capsys):
 
 def test_init_of_a_variation(tmp_path):
     """Dino's tail without motors: four are gone, the others' torques and the normaliser are as they were."""
-    clip, rng = mocap.builtin_clips()[0][:40], np.random.default_rng(0)
+    clip, rng = data.builtin_clips()[0][:40], np.random.default_rng(0)
     whole, limp = (character.load("dino", tail=tail) for tail in (None, "passive"))
     a, b = (Env(c, retarget.reference(c, [clip]), 3, threads=1) for c in (whole, limp))
     assert a.obs_size == b.obs_size and a.action_size == b.action_size + 4
@@ -1021,7 +1023,7 @@ def test_ship(tmp_path, monkeypatch):
     folder = tmp_path / "motion"
     folder.mkdir()
     (folder / "LICENSE").write_text("Non-commercial.\n")
-    monkeypatch.setattr(mocap, "sequences", lambda *a, **k: mocap.builtin_clips()[:1])
+    monkeypatch.setattr(data, "sequences", lambda *a, **k: data.builtin_clips()[:1])
     size = ["--envs", "4", "--horizon", "4", "--steps", "16", "--minibatch", "16"]
     ppo.main(["--motion", str(folder), "--out", str(tmp_path / "run"), *size])
     target = tmp_path / "jesse.npz"

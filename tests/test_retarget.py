@@ -8,14 +8,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import bvh
 import character
-import gait
-import mocap
-import render
 import retarget
-from mocap import PARENTS, SEG, SEGMENTS, Clip
-from runs import UserError
+from human import (
+    PARENTS,
+    SEG,
+    SEGMENTS,
+    SENSOR_OFFSETS,
+    Clip,
+    contacts,
+    headset_height,
+    quat_about,
+    quat_angle,
+    resample,
+    sensors,
+)
+from mocap import augment, bvh, data, gait
+from plumbing import render
+from plumbing.cli import UserError
 
 ALL_THREE = ("chest", "head", "upper_arm_l", "upper_arm_r", "thigh_l", "thigh_r")  # segments with three hinges or more
 BODY_OF = {"chest": "spine3"}  # Jesse's body of a segment, where the names differ
@@ -23,7 +33,7 @@ BODY_OF = {"chest": "spine3"}  # Jesse's body of a segment, where the names diff
 
 def sizes(clip):
     """Of the human: hip and headset height [m]."""
-    return clip.hip_height, mocap.headset_height(clip)
+    return clip.hip_height, headset_height(clip)
 
 
 def clip_of(kind, seconds=6.0, seed=0, **params) -> Clip:
@@ -54,7 +64,7 @@ def recorded(mocap_dir, *patterns):
     files = [f for p in patterns for f in sorted(mocap_dir.rglob(p))[:2]]
     if not files:
         pytest.skip(f"{mocap_dir} holds none of {', '.join(patterns)}")
-    return [mocap.resample(mocap.from_bvh(f), mocap.CONTROL_RATE) for f in files]
+    return [resample(data.from_bvh(f), data.CONTROL_RATE) for f in files]
 
 
 REAL = ("dataset-*_walk_normal_0*.bvh", "dataset-*_run_normal_0*.bvh", "*afan1*.bvh")
@@ -390,7 +400,7 @@ def test_euler_angles_go_on():
 def test_sensor_scale(char, mini):
     """A user who stands upright wears the headset as high as the character, whatever the proportions."""
     for body in ({}, {"height": 1.2}, {"trunk": 1.3}, {"arms": 0.8}):
-        clip = mocap.resize(clip_of("walk", height=1.6), **body)
+        clip = augment.resize(clip_of("walk", height=1.6), **body)
         q = np.tile([1.0, 0, 0, 0], (len(clip), 15, 1))
         pos = clip.pos.copy()
         pos[:, 0] = [0.0, 0.0, clip.hip_height]
@@ -398,7 +408,7 @@ def test_sensor_scale(char, mini):
             if SEGMENTS[i] in ("chest", "head"):
                 pos[:, i] = pos[:, parent] + [0.0, 0.0, clip.limb(SEGMENTS[parent], SEGMENTS[i])]
         upright = dataclasses.replace(clip, pos=pos, quat=q)
-        top = mocap.sensors(upright)[0][0, 0, 2] * retarget.sensor_scale(char, *sizes(clip))
+        top = sensors(upright)[0][0, 0, 2] * retarget.sensor_scale(char, *sizes(clip))
         d = posed(char.model, np.concatenate([[0, 0, char.hip_height], char.rest[char.root], char.default]))
         np.testing.assert_allclose(top[2], d.site_xpos[char.sensor_sites[0], 2], rtol=1e-6)
         np.testing.assert_array_equal(top[:2] > 0, True)
@@ -469,7 +479,7 @@ def test_share_and_default_of_a_negative_hinge(tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML.replace('to = "head" }', 'to = "head", y = 0.5 }'))
     c, clip = character.load(tmp_path / "mini.toml"), clip_of("stand", 1.0)
     quat = np.tile([1.0, 0, 0, 0], (len(clip), 15, 1))
-    quat[:, SEG["head"]] = mocap.quat_about(1, 0.4)
+    quat[:, SEG["head"]] = quat_about(1, 0.4)
     pose = retarget.retarget(c, dataclasses.replace(clip, quat=quat))
     np.testing.assert_allclose(pose.qpos[:, 7 + c.hinges.index("head_y")], 0.3 - 0.2, atol=1e-12)
 
@@ -533,7 +543,7 @@ def test_reference(char, mini, clips):
                 out = np.zeros(6)
                 mujoco.mj_objectVelocity(char.model, d, mujoco.mjtObj.mjOBJ_XBODY, b, out, 0)
                 np.testing.assert_allclose(ref.link_vel[f, i], out[3:], atol=1e-5)
-            for i, (s, offset) in enumerate(zip(("head", "hand_l", "hand_r"), mocap.SENSOR_OFFSETS, strict=True)):
+            for i, (s, offset) in enumerate(zip(("head", "hand_l", "hand_r"), SENSOR_OFFSETS, strict=True)):
                 turn = rotation(clip.quat[t, SEG[s]])
                 where = (clip.pos[t, SEG[s]] + turn.apply(offset)) * retarget.sensor_scale(char, *sizes(clip))
                 np.testing.assert_allclose(ref.sensor_pos[f, i], where, atol=1e-9)
@@ -580,7 +590,7 @@ def test_artefacts(char, clips):
     found = retarget.artefacts(char, clip, pose)
     soles = np.array([slow_soles(char, posed(char.model, q)) for q in pose.qpos])
     height, speed = slow_sole_motion(soles, clip.rate)
-    contact = mocap.contacts(clip)
+    contact = contacts(clip)
     low = [min(h) for h in height]
     sunk = [h for h in low if h < 0]
     on = [(t, f) for t in range(len(clip)) for f in range(2) if contact[t, f]]
@@ -597,7 +607,7 @@ def test_artefacts(char, clips):
 
 def sole_height_in_contact(char, clip):
     soles = retarget.forward_kinematics(char, retarget.retarget(char, clip).qpos).soles
-    return np.abs(soles[..., 2].min(axis=2)[mocap.contacts(clip)]).mean()
+    return np.abs(soles[..., 2].min(axis=2)[contacts(clip)]).mean()
 
 
 def test_feet_on_the_floor(char, clips):
@@ -675,10 +685,10 @@ def test_bvh_round_trip(tmp_path):
 def test_bvh_is_a_human_again(tmp_path, capsys):
     """The character's own file, read as a human of an unknown rig."""
     char, pose, clip = exported(tmp_path / "walk.bvh")
-    got = mocap.from_bvh(tmp_path / "walk.bvh")
+    got = data.from_bvh(tmp_path / "walk.bvh")
     assert "unit cm" in capsys.readouterr().err
     for s in ("thigh_l", "shin_r", "upper_arm_l", "forearm_r", "pelvis"):
-        assert np.degrees(mocap.quat_angle(got.quat, clip.quat))[:, mocap.SEG[s]].mean() < 8, s
+        assert np.degrees(quat_angle(got.quat, clip.quat))[:, SEG[s]].mean() < 8, s
 
 
 def test_bvh_in_another_library(tmp_path):

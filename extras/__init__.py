@@ -1,0 +1,1 @@
+"""Ours, beyond the paper: recipes, shipping, GPU, Gymnasium, benchmarks."""

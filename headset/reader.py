@@ -1,0 +1,528 @@
+"""headset.reader."""
+
+from __future__ import annotations
+
+import queue
+import re
+import sys
+import threading
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from human import heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate, quat_slerp
+from mocap.data import CONTROL_RATE
+from plumbing.cli import UserError
+from plumbing.files import kind_of, parse_number
+from retarget import Reference
+
+DEVICES = ("head", "left", "right")
+PARTS = ("px", "py", "pz", "qx", "qy", "qz", "qw")
+COLUMNS = ("time", *(f"{d}_{p}" for d in DEVICES for p in PARTS))
+SAMPLE_RATE = 90.0  # Hz, of a stream without times
+LINE_LIMIT = 65536  # bytes
+UNREADABLE_LIMIT = 100  # unreadable lines in a row that end a live stream
+EMPTY = ("", "nan", "null", "none")
+STEPS, JUDGED = (0.0005, 0.1), 11  # s between two rows of a headset; steps by whose median a time column is judged
+SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}  # which are not ours
+
+# ------------------------------------------------------------------------------------ reading
+
+
+class Sample(NamedTuple):
+    """One reading of the three devices: t [s], pos (3, 3) [m], quat (3, 4); NaN where there is none."""
+
+    t: float
+    pos: np.ndarray
+    quat: np.ndarray
+
+
+def column(name: str) -> str | None:
+    """The canonical name of a column, or None for one that is not ours.
+
+    Test      tests/headset/test_stream.py::test_columns"""
+    name = name.strip().strip('"').lower()
+    if name in ("time", "t", "timestamp"):
+        return "time"
+    device = r"(head|hmd|headset|(?:left|right)(?:_hand|_controller)?)"
+    found = re.fullmatch(device + r"_(?:(?:p|pos_|position_|)([xyz])|(?:q|rot_|rotation_)([xyzw]))", name)
+    if not found:
+        return None
+    device = "head" if found[1] in ("head", "hmd", "headset") else found[1].split("_")[0]
+    return f"{device}_p{found[2]}" if found[2] else f"{device}_q{found[3]}"
+
+
+class Reader:
+    """Lines -> Samples, in the file's own axes, quaternions x, y, z, w.
+
+    name   : of the source, for complaints
+    strict : a line that cannot be read is an error (files); otherwise it is skipped and counted (live streams), and
+             100 of them in a row are an error.  A file's last line may be cut short: it is skipped
+    devices : 3, or 1: the headset's columns alone
+    Test     tests/headset/test_stream.py::test_columns, test_garbage_lines, test_garbage_on_stdin, test_headset_only,
+             test_time_columns
+    """
+
+    def __init__(self, name: str, strict=True, devices=3):
+        self.name, self.strict = name, strict
+        self.steps, self.before = [], None  # of the time column [s]
+        self.wanted = COLUMNS[: 1 + devices * len(PARTS)]
+        self.line = self.unreadable = self.in_a_row = 0
+        self.at = self.names = None
+
+    def read(self, lines):
+        """Samples of an iterable of lines (bytes or text), one by one."""
+        for line in lines:
+            self.line += 1
+            text = line.decode("utf-8", "replace") if isinstance(line, bytes) else line
+            if self.at is None and "\r" in text.strip() and "\0" not in text:
+                raise UserError(f"{self.name}, line {self.line}: line ends of CR alone; valid: LF, or CR and LF")
+            if len(text) >= LINE_LIMIT:
+                raise UserError(f"{self.name}, line {self.line}: longer than {LINE_LIMIT} bytes; valid: a CSV's lines")
+            cells = text.lstrip("\ufeff").strip()
+            if not cells or cells.startswith("#"):
+                continue
+            if self.at is None:
+                if "\0" in text:
+                    raise UserError(f"{self.name}, line {self.line}: UTF-16 or no text; valid: a CSV's lines in UTF-8")
+                self.header(cells)
+                continue
+            try:
+                values = self.values(cells)
+            except ValueError as error:
+                self.unreadable += 1
+                self.in_a_row += 1
+                if self.strict and text.endswith("\n") or self.in_a_row >= UNREADABLE_LIMIT:
+                    raise UserError(f"{self.name}, line {self.line}, {error}") from None
+                continue
+            self.in_a_row = 0
+            devices = values[1:].reshape(3, 7)
+            if len(self.steps) < JUDGED and not fault(devices[0]):
+                self.judge(float(values[0]))
+            yield Sample(float(values[0]), devices[:, :3], devices[:, 3:])
+        if self.at is None:
+            raise UserError(f"{self.name}: is empty; expected a line of column names: {valid_columns()}")
+
+    def judge(self, t):
+        """UserError if the first times cannot be a headset's seconds; rows before it was tracked do not count."""
+        if np.isfinite(t):
+            self.steps += [] if self.before is None else [t - self.before]
+            self.before = t
+        if len(self.steps) < JUDGED:
+            return
+        step = sorted(self.steps)[JUDGED // 2] or sum(self.steps) / JUDGED  # coarse times: most are as the one before
+        if STEPS[0] <= step < 0.999 * STEPS[1]:
+            return
+        named = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "minutes": 60.0, "hours": 3600.0}
+        unit = next((f": {name}?" for name, u in named.items() if 20 <= 1 / max(abs(step) * u, 1e-300) <= 1000), "")
+        valid = f"seconds that increase, {1 / STEPS[1]:.0f} to {1 / STEPS[0]:.0f} rows in each"
+        what = f"time steps of {step:.3g} s{unit}"
+        if step <= 0:
+            what = f"time runs backwards, by {-step:.3g} s a row" if step else "time stands still"
+            valid += ", or no column time (then --sample-rate says how many)"
+        raise UserError(f"{self.name}, line {self.line}, column {self.names[self.at[0]]}: {what}; valid: {valid}")
+
+    def header(self, line):
+        """The first line: where which column is."""
+        self.names = [c.strip() for c in line.split(",")]
+        known = [column(c) for c in self.names]
+        ours = lambda mark: sum(c is not None for c in map(column, line.split(mark)))  # noqa: E731
+        mark = max(SEPARATORS, key=ours)
+        if ours(mark) > max(ours(","), 1):
+            valid = "commas, and points in the numbers"
+            raise UserError(f"{self.name}, line {self.line}: {SEPARATORS[mark]} between the columns; valid: {valid}")
+        missing = [c for c in self.wanted[1:] if c not in known]
+        twice = [c for c, k in Counter(known).items() if c and k > 1]
+        if twice:
+            raise UserError(f"{self.name}, line {self.line}: column {twice[0]} is there twice; valid: once each")
+        if missing:
+            more = f" and {len(missing) - 4} more" if len(missing) > 4 else ""
+            alone = "" if any(c.startswith("head") for c in missing) else "; --sensors hmd needs the headset's alone"
+            raise UserError(
+                f"{self.name}, line {self.line}: no column {', '.join(missing[:4])}{more}; "
+                f"it has {', '.join(self.names)[:200]}; valid: {valid_columns()}{alone}"
+            )
+        self.at = [known.index(c) if c in known else -1 for c in self.wanted]
+
+    def values(self, line):
+        """The numbers of a row in the order of COLUMNS.  ValueError: which column, and why."""
+        cells = line.split(",")
+        if len(cells) != len(self.names):
+            column = self.names[min(len(cells), len(self.names)) - 1]
+            comma = " (commas in the numbers? valid: points)" if len(cells) > len(self.names) else ""
+            valid = f"{len(self.names)}, as in the first line{comma}"
+            raise ValueError(f"column {column}: {len(cells)} cells; valid: {valid}")
+        out = np.full(len(COLUMNS), np.nan)
+        for k, i in enumerate(self.at):
+            cell = cells[i].strip().strip('"') if i >= 0 else ""
+            if cell.lower() not in EMPTY:
+                try:
+                    out[k] = parse_number(cell)
+                except ValueError:
+                    raise ValueError(f"column {self.names[i]}: {cell[:40]!r}; valid: a number, or nothing") from None
+        return out
+
+
+def valid_columns() -> str:
+    """The columns as a complaint lists them.  Test: tests/headset/test_stream.py::test_columns"""
+    return "time (optional) and DEVICE_px, _py, _pz, _qx, _qy, _qz, _qw for DEVICE head, left, right"
+
+
+def is_live(path) -> bool:
+    """Whether "-" or a named pipe, to be read as the lines come, or a file.
+
+    Raises    UserError: nothing there, a folder, a device
+    Test      tests/headset/test_stream.py::test_pipes"""
+    if str(path) == "-":
+        return True
+    valid = "a .csv file, a named pipe, or - for standard input"
+    try:
+        kind = kind_of(path)
+    except (OSError, ValueError) as error:
+        why = "no such file" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", None) or error
+        raise UserError(f"--stream {path}: {why}; valid: {valid}") from None
+    if kind not in (None, "a pipe"):
+        raise UserError(f"--stream {path}: is {kind}; valid: {valid}")
+    return kind is not None
+
+
+def lines_of(path):
+    """The lines of a file or a pipe, or of standard input for "-", as they come, none longer than LINE_LIMIT.
+
+    Raises    UserError: as `is_live`, or it cannot be read
+    Test      tests/headset/test_stream.py::test_columns, test_stdin, test_pipes"""
+    if str(path) == "-":
+        yield from iter(lambda: sys.stdin.buffer.readline(LINE_LIMIT), b"")
+        return
+    is_live(path)
+    try:
+        with open(path, "rb") as file:
+            yield from iter(lambda: file.readline(LINE_LIMIT), b"")
+    except OSError as error:
+        raise UserError(f"--stream {path}: {error.strerror or error}; valid: a file that can be read") from None
+
+
+def arriving(items, silence: float, period: float):
+    """The items of an iterator as they come, and how many seconds nothing came: first `silence`, then every `period`.
+
+    A thread reads ahead, 1000 items at most.
+    Test      tests/headset/test_stream.py::test_stdin_that_pauses"""
+    box, end = queue.Queue(1000), object()
+
+    def read():
+        try:
+            for item in items:
+                box.put(item)
+            box.put(end)
+        except BaseException as error:  # noqa: BLE001, raised again where it can be seen
+            box.put(error)
+
+    threading.Thread(target=read, daemon=True).start()
+    wait = silence
+    while True:
+        try:
+            item = box.get(timeout=wait)
+        except queue.Empty:
+            yield float(wait)
+            wait = period
+            continue
+        wait = silence
+        if item is end:
+            return
+        if isinstance(item, BaseException):
+            raise item
+        yield item
+
+
+# ------------------------------------------------------------------------------------ axes
+
+AXES = {  # name -> matrix whose rows are our x (forward), y (left), z (up) in the source's coordinates
+    "unity": np.array([[0.0, 0, 1], [-1, 0, 0], [0, 1, 0]]),  # x right, y up, z forward: left-handed
+    "openxr": np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]),  # x right, y up, z backward: right-handed
+    "mujoco": np.eye(3),  # ours
+}
+# How far the fingers point below the controller's forward axis [degrees].  ASSUMED.  90: OpenXR's grip pose, whose
+# forward axis runs along the fist from the little finger to the thumb.  15: what points, as a ray or a sabre does.
+GRIP = {"unity": 15.0, "openxr": 90.0, "mujoco": 90.0}
+
+
+def to_world(pos, quat, axes: str, grip: float | None = None):
+    r"""A source's axes -> ours: x forward, y left, z up, right-handed.
+
+    Equation  p' = M p;  R' = M R Mᵀ, so that (x, y, z, w) -> (w, det(M) M (x, y, z)): an axis of rotation is an
+              axial vector, and a left-handed source's turns are the other way round
+              hands: R' R_y(−(90° − grip)), because the canonical hand's fingers point along −z
+    Args      pos (..., 3, 3) [m], quat (..., 3, 4) x, y, z, w, of head, left, right
+              axes : unity, openxr or mujoco; grip [degrees], of the axes by default
+    Returns   pos (..., 3, 3), quat (..., 3, 4) w, x, y, z
+    Raises    UserError: unknown axes
+    Test      tests/headset/test_stream.py::test_axes_by_hand, test_axes_against_matrices, test_grip
+    """
+    if axes not in AXES:
+        raise UserError(f"--axes {axes}: unknown; valid: {', '.join(AXES)}")
+    m, quat = AXES[axes], np.asarray(quat, float)
+    turn = np.radians(-90.0 + (GRIP[axes] if grip is None else grip))
+    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is the Guard's
+        q = np.concatenate([quat[..., 3:], np.round(np.linalg.det(m)) * (quat[..., :3] @ m.T)], axis=-1)
+        if turn:
+            q[..., 1:, :] = quat_mul(q[..., 1:, :], quat_about(1, turn))
+        return np.asarray(pos, float) @ m.T, q
+
+
+# ------------------------------------------------------------------------------------ what can go wrong
+
+GAP = 0.1  # s without a row: a drop-out
+FROZEN = 0.25  # s without any change while another device moves: lost
+FAR_AWAY = 100.0  # m from the source's origin: not a place
+REACH = 1.5  # m from headset to controller: longer than an arm
+TELEPORT = 1.0  # m between two headset poses: the stream is re-anchored
+STEP = 0.2  # m between two samples of a headset: too fast for a head
+JUMP = 0.5  # m between two samples of a controller: too fast for a hand
+SETTLE = 0.1  # s that a controller which jumped must stay where it is
+HOLD, RELAX = 1.0, 0.5  # s that a lost controller is held; time constant with which it then sinks
+BLEND, CATCH_UP = 0.3, 2.0  # s, m/s: the way back from the held to the true pose
+CLOCK_AHEAD, CLOCK_BACK = 5.0, 1.0  # s: farther jumps of the time column are another clock
+# The hanging hand in the headset's heading frame [m], of a user of 1.75 m (the built-in human).  ASSUMED
+NEUTRAL = np.array([[0.0, 0.0, 0.0], [-0.04, 0.26, -0.90], [-0.04, -0.26, -0.90]])
+
+
+def controllers_hang(ref: Reference) -> Reference:
+    r"""The reference with controllers that hang beside the user, wherever the headset goes  [Reda23 §4.2].
+
+    Equation  p_i = p_head + s ⊙ R_z(ψ) n_i,  R_i = R_z(ψ): ψ the headset's heading, s the devices' scale, n NEUTRAL
+    Why       how a policy that was trained with three devices is driven with one.  ASSUMED: §4.2 does not say; it is
+              also what `Guard` gives for controllers that were never seen
+    Test      tests/headset/test_stream.py::test_controllers_hang
+    """
+    turn = quat_about(2, heading(ref.sensor_quat[:, 0]))[:, None]  # (F, 1, 4)
+    pos, quat = ref.sensor_pos.copy(), ref.sensor_quat.copy()
+    pos[:, 1:] = pos[:, :1] + ref.sensor_scale[:, None] * quat_rotate(turn, NEUTRAL[1:])
+    quat[:, 1:] = turn
+    return replace(ref, sensor_pos=pos, sensor_quat=quat, sensor_rot=quat_matrix(quat)[..., :2].astype(np.float32))
+
+
+class Clock:
+    """The time column -> seconds since the first row, never backwards.
+
+    Rule    no time, or NaN, or ten rows of one time: 1 / rate after the row before; a row up to 1 s before its
+            predecessor is dropped; a jump back by more, or by more than 5 s ahead, is another clock: 1 / rate is taken
+    Test    tests/headset/test_stream.py::test_unordered_times, test_another_clock
+    """
+
+    def __init__(self, rate=SAMPLE_RATE):
+        self.rate, self.last, self.base = rate, None, 0.0
+        self.dropped = self.jumps = self.same = 0
+        self.forget = False  # the next row tells a new time
+
+    def stamp(self, t: float) -> float | None:
+        """Seconds since the first row, or None for a row to drop."""
+        if self.last is None:
+            self.base = -t if np.isfinite(t) else 0.0
+            self.last = 0.0
+            return 0.0
+        step = t + self.base - self.last if np.isfinite(t) else 1.0 / self.rate
+        step = 0.0 if abs(step) < 1e-9 else step
+        self.same = self.same + 1 if step == 0 else 0
+        if self.forget or self.same >= 10 or not -CLOCK_BACK <= step <= CLOCK_AHEAD:
+            self.jumps += not self.forget
+            step = 1.0 / self.rate
+            self.base = self.last + step - t if np.isfinite(t) else self.base
+        self.forget = False
+        if step < 0:
+            self.dropped += 1
+            return None
+        self.last += step
+        return self.last
+
+    def idle(self, seconds: float) -> float:
+        """Time goes on without rows."""
+        self.last, self.forget = (self.last or 0.0) + seconds, True
+        return self.last
+
+
+@dataclass
+class Track:
+    """What the Guard knows of one device."""
+
+    raw: np.ndarray | None = None  # (7,) of the last usable row, as it came
+    changed: float = -np.inf  # s, when raw last changed
+    good: np.ndarray | None = None  # (3,) last position taken as true, anchored world
+    yaw: float = 0.0  # its heading
+    lost: str | None = "not seen"  # why, or None
+    since: float = 0.0  # s, lost since
+    jumped: np.ndarray | None = None  # (3,) where a controller jumped to
+    settling: float = 0.0  # s, since when it is there
+    last: tuple | None = None  # pose given out: of the headset in the world, of a controller in its heading frame
+    held: tuple | None = None  # pose to blend from, likewise
+    mix: float = 1.0  # 0 held .. 1 true
+    pace: float = 0.0  # of mix, per second
+
+
+def fault(row) -> str | None:
+    """Why a device's row (7,) cannot be a pose, or None.  Test: tests/headset/test_stream.py::test_faults"""
+    if not np.isfinite(row).all():
+        return "not finite"
+    if not row.any():
+        return "all zero"
+    if np.abs(row[:3]).max() > FAR_AWAY:
+        return "far away"
+    return "no rotation" if abs(np.linalg.norm(np.clip(row[3:], -1e3, 1e3)) - 1.0) > 0.1 else None
+
+
+class Guard:
+    r"""Three devices that may be lost at any time -> three finite poses.
+
+    Rule      a device is lost in a row that is all zero, not finite, no rotation (| |q| − 1 | > 0.1) or more than
+              100 m away; when it has not changed for 0.25 s while another one moved; a controller also when it is
+              1.5 m from the headset, or moved by more than 0.5 m between two rows, until it has stayed there for
+              0.1 s.  More than 0.1 s without a row: all are lost
+    Hold      a lost headset stays where it was.  A lost controller keeps its place relative to the headset; after 1 s
+              it sinks to hang beside the body (time constant 0.5 s)
+    Return    from the held to the true pose in 0.3 s, or at 2 m/s if that is longer; likewise a headset after a step
+              of more than 0.2 m between two rows
+    Anchor    a headset that comes back, or moves between two rows, by more than 1 m has been teleported: the whole
+              stream is then shifted and turned about the vertical, so that the headset goes on from where it was (its
+              height only if that changed by more than 0.5 m)
+    Devices   with `devices` 1 there are no controllers: they hang beside the body, and nothing is lost
+    Frame     `to_world`'s, quaternion w, x, y, z; times from `Clock`
+    Test      tests/headset/test_stream.py::test_zero_rows, test_nan_rows, test_frozen_sensor, test_drop_out,
+              test_teleport,
+              test_controller_glitch, test_never_nan
+    """
+
+    def __init__(self, rate=CONTROL_RATE, devices=3):
+        self.rate, self.devices, self.t = rate, devices, None
+        self.tracks = [Track() for _ in DEVICES]
+        self.yaw, self.shift = 0.0, np.zeros(3)  # the anchor: p' = R_z(yaw) p + shift
+        self.events, self.seconds = Counter(), Counter()  # (device, what) -> how often, how long
+        self.heads = Counter()  # what the headset's rows were: a fault, or None -> how many
+
+    def push(self, sample: Sample, why=None) -> list[Sample]:
+        """The poses to use, in order: several after a drop-out, none before the headset is seen.
+
+        Args      why : the whole row is no reading, for this reason"""
+        out = []
+        if self.t is not None and sample.t - self.t > GAP:
+            nothing = np.full((3, 7), np.nan)
+            while self.t + 1.0 / self.rate < sample.t:
+                out.append(self._one(self.t + 1.0 / self.rate, nothing, "drop-out"))
+        out.append(self._one(sample.t, np.concatenate([sample.pos, sample.quat], axis=1), why))
+        return [s for s in out if s is not None]
+
+    def live(self, device=0) -> bool:
+        """Is the last pose given out the device's own, not a held or blended one?"""
+        return self.tracks[device].lost is None and self.tracks[device].mix >= 1.0
+
+    def report(self) -> list[str]:
+        """What happened, one line a kind.  Test: tests/headset/test_stream.py::test_zero_rows"""
+        lines = []
+        for key, n in sorted(self.events.items()):
+            if key[0] not in DEVICES[: self.devices]:
+                continue
+            lasted = f", {self.seconds[key]:.2f} s" if self.seconds[key] else ""
+            lines.append(f"{' '.join(key)}: {n} time{'s' * (n > 1)}{lasted}")
+        return lines
+
+    def _one(self, t, rows, why=None):
+        """One row of every device -> Sample or None."""
+        dt = 0.0 if self.t is None else t - self.t
+        self.t = t
+        faults = [why or fault(row) for row in rows]
+        for track, row, bad in zip(self.tracks, rows, faults):
+            if not bad and (track.raw is None or not np.array_equal(track.raw, row)):
+                track.raw, track.changed = row, t
+        newest = max(track.changed for track in self.tracks)
+        for i, track in enumerate(self.tracks):
+            if not faults[i] and t - track.changed > FROZEN and newest > track.changed:
+                faults[i] = "frozen"
+        self.heads[faults[0]] += why is None
+        lost = np.array([bool(f) for f in faults])
+        rows = np.where(lost[:, None], [0.0, 0, 0, 1, 0, 0, 0], rows)
+        quat = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+        if not faults[0]:
+            self._anchor(rows[0, :3], quat[0])
+        turn = quat_about(2, self.yaw)
+        pos, quat = quat_rotate(np.tile(turn, (3, 1)), rows[:, :3]) + self.shift, quat_mul(turn, quat)
+        head = self._device(0, t, dt, faults[0], (pos[0], quat[0]), (np.zeros(3), np.array([1.0, 0, 0, 0])))
+        if head is None:
+            return None
+        frame = head[0], quat_about(2, heading(head[1]))
+        out = [head]
+        for i in (1, 2):
+            bad = faults[i] or self._astray(i, t, pos[i], head[0])
+            out.append(self._device(i, t, dt, bad, (pos[i], quat[i]), frame))
+        return Sample(t, np.stack([p for p, _ in out]), np.stack([q for _, q in out]))
+
+    def _anchor(self, pos, quat):
+        """Re-anchor the stream if its headset, given as it came, is suddenly elsewhere."""
+        head = self.tracks[0]
+        place = lambda: quat_rotate(quat_about(2, self.yaw), pos) + self.shift  # noqa: E731
+        if head.good is not None and np.linalg.norm(place() - head.good) > TELEPORT:
+            self.events["head", "teleport"] += 1
+            self.yaw = float(head.yaw - heading(quat))
+            gap = head.good - place()
+            self.shift = self.shift + gap * [1.0, 1.0, abs(gap[2]) > 0.5]
+        head.yaw = float(heading(quat)) + self.yaw
+
+    def _astray(self, i, t, pos, head):
+        """Why a controller's usable row is not to be believed, or None."""
+        track = self.tracks[i]
+        if np.linalg.norm(pos - head) > REACH:
+            return "out of reach"
+        if track.lost in (None, "jump") and track.good is not None and np.linalg.norm(pos - track.good) > JUMP:
+            if track.jumped is None or np.linalg.norm(pos - track.jumped) > JUMP:
+                track.settling = t
+            track.jumped = pos
+            if t - track.settling < SETTLE:
+                return "jump"
+        track.jumped = None
+        return None
+
+    def _device(self, i, t, dt, bad, true, frame):
+        """Hold, blend or believe one device.  true, frame : (pos, quat), world -> (pos, quat), or None: never seen."""
+        track = self.tracks[i]
+        if bad:
+            if track.last is None and i == 0:
+                return None
+            if track.last is None:
+                track.last = (NEUTRAL[i], np.array([1.0, 0, 0, 0]))
+            if track.lost is None or track.held is None:
+                track.held, track.since = track.last, t
+            if track.lost != bad:
+                self.events[DEVICES[i], bad] += 1
+            self.seconds[DEVICES[i], bad] += dt
+            track.lost, track.mix = bad, 0.0
+            if i and t - track.since > HOLD:
+                share = 1.0 - np.exp(-dt / RELAX)
+                track.held = blend(track.held, (NEUTRAL[i], np.array([1.0, 0, 0, 0])), share)
+            track.last = track.held
+        else:
+            own = to_frame(frame, true)
+            step = i == 0 and track.lost is None and np.linalg.norm(true[0] - track.good) > STEP
+            if track.last is not None and (track.lost or step):
+                if step:
+                    self.events["head", "step"] += 1
+                track.held, track.mix = track.last, 0.0
+                track.pace = 1.0 / max(BLEND, np.linalg.norm(own[0] - track.held[0]) / CATCH_UP)
+            track.lost, track.good = None, true[0]
+            track.mix = min(1.0, track.mix + dt * track.pace)
+            track.last = own if track.mix >= 1.0 else blend(track.held, own, track.mix)
+        return from_frame(frame, track.last)
+
+
+def blend(a, b, share):
+    """Between the poses a and b (pos, quat).  Test: tests/headset/test_stream.py::test_poses"""
+    return a[0] + share * (b[0] - a[0]), quat_slerp(a[1], b[1], share)
+
+
+def to_frame(frame, pose):
+    """A world pose (pos, quat) in a frame, itself a pose.  Test: tests/headset/test_stream.py::test_poses"""
+    back = quat_conj(frame[1])
+    return quat_rotate(back, pose[0] - frame[0]), quat_mul(back, pose[1])
+
+
+def from_frame(frame, pose):
+    """A pose in a frame -> the world.  Test: tests/headset/test_stream.py::test_poses"""
+    return frame[0] + quat_rotate(frame[1], pose[0]), quat_mul(frame[1], pose[1])

@@ -1,0 +1,1 @@
+"""Motion capture: any rig to the canonical human of human.py; stitching, augmentation, data sets."""

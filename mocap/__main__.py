@@ -1,0 +1,7 @@
+"""Motion capture on the command line: python -m mocap inspect FILE | FOLDER, or fetch NAME."""
+
+from mocap.inspect import main
+from plumbing.cli import run_main
+
+if __name__ == "__main__":
+    run_main(main)

@@ -1,0 +1,252 @@
+r"""Human motion: one canonical human, whatever the rig  [Reda23 §3.4, App. A].
+
+    read a file ──────► canonical Clip ──► resample ──► stitch ──► sensors, contacts
+    (mocap/rigs.py)           15 segments        30 Hz        ≥ 30 s     §3.4    App. A
+    or mocap/gait.py
+
+Everything after the reader speaks of one human only: 15 named segments, each with a joint centre and an
+anatomical frame that equals the world's axes (x forward, y left, z up) when the person stands upright with
+the arms hanging.  Metres, radians, seconds; quaternions w, x, y, z.
+
+    python -m mocap inspect FILE      skeleton, rate, length, speed, contacts
+    python -m mocap inspect FOLDER    one line a clip, and what stitching makes of them
+    python -m mocap fetch NAME        download bandai, cmu or lafan1 (mocap/fetch.py)
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+
+from human import Clip, resample
+from mocap import bvh, gait
+from mocap.guess import _unknown
+from mocap.rigs import AS_IT_IS, RIGS, _unit, canonical, from_amc, is_amc, read, rig_of
+from mocap.stitch import stitch
+from plumbing.cli import UserError
+
+CONTROL_RATE = 30.0  # Hz, ASSUMED: Table 3 is not in the text we have
+
+
+# ------------------------------------------------------------------------------------ data sets
+
+SPLITS = ("train", "validation", "style", "body", "all")
+
+
+def split_of(name: str) -> str:
+    """Which part of a data set a clip belongs to: by its name only, so that no run can see a held-out clip by accident.
+
+    body        : NAME.amc (unseen bodies)
+    style       : the whole style `youthful` (unseen style)
+    validation  : every clip whose trailing number ends in 5 (unseen clips; in LaFAN1 that is subject 5)
+    train       : the rest
+    Test        tests/mocap/test_mocap.py::test_split, tests/mocap/test_amc.py::test_body_split
+    """
+    if is_amc(name):
+        return "body"
+    if "youthful" in name:
+        return "style"
+    number = re.search(r"(\d+)$", name)
+    return "validation" if number and number.group(1).endswith("5") else "train"
+
+
+BUILTIN = {"builtin": gait.MIX, "standing": gait.STANDING}  # the data sets that need no download
+MOTION = "builtin, standing, a .bvh or .amc file, or a folder of them; or several with commas between them"
+
+
+def builtin_clips(rate=CONTROL_RATE, seed=0, name="builtin") -> list[Clip]:
+    """The procedural human of mocap/gait.py: people who walk (builtin) or stand and step (standing).
+
+    Test      tests/mocap/test_mocap.py::test_builtin, ::test_joined"""
+    out = []
+    library = gait.library(rate=rate, seed=seed, mix=BUILTIN[name])
+    for i, m in enumerate(library):
+        number = (i + 5) % len(library)  # so that builtin's two clips held out, 005 and 015, are straight walks
+        title = f"{m['name'].split('_')[1]}_{number:03d}"
+        out.append(Clip(title, f"{name}-{number:03d}", m["rate"], m["pos"], m["quat"], m["ball"]))
+    return out
+
+
+SETS = "builtin, standing, a .bvh or .amc file, a folder of them, several with commas between them"
+
+
+def parts(motion) -> list[str]:
+    """The data sets of a --motion: one, or several with commas between them (unless a file has that name).
+
+    Test      tests/mocap/test_mocap.py::test_joined"""
+    sets = str(motion).split(",") if not Path(motion).exists() else [str(motion)]
+    if "" in sets:
+        raise UserError(f"--motion {motion}: an empty name, a comma too many; valid: {SETS}")
+    return sets
+
+
+def licences(sets) -> list[str]:
+    """Of each data set that is not built in: its name, and the first line of the licence file beside it.
+
+    Test      tests/mocap/test_mocap.py::test_licences, tests/test_ppo.py::test_ship
+    """
+    out = []
+    for path in (Path(s) for s in sets if s not in BUILTIN):
+        notes = sorted(path.glob("LICENSE*")) if path.is_dir() else []
+        text = notes[0].read_text(errors="replace") if notes else "no licence file beside the motion"
+        title = text.strip().split("\n")[0]
+        out.append(f"{path.name}, licensed: {title}")
+    return out
+
+
+def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS_IT_IS) -> list[Clip]:
+    """Single clips of a data set, at one rate.
+
+    Args      motion : "builtin", "standing", a .bvh or .amc file, or a folder of them (searched below); or several of
+              these with commas between them: each must have what is asked for
+              clips : shell pattern on the names; reading : what the user says about joints, unit and axes of BVH files
+              split : train | validation | style | body | all.  A folder of fewer than ten files none of whose names is
+              in the split is used whole, and says so.  .amc clips are in `body` alone, unless motion holds nothing
+              else: then it is meant, its clips are also split by their numbers, and it says so
+    Raises    UserError: nothing there, a malformed file, or nothing matches; names what would have been valid
+    Test      tests/mocap/test_mocap.py::test_split, ::test_load_errors, ::test_bandai_loads_in_seconds,
+              tests/mocap/test_amc.py::test_body_split
+    """
+    if split not in SPLITS:
+        raise UserError(f"split {split!r} is unknown; valid: {', '.join(SPLITS)}")
+    if len(sets := parts(motion)) > 1:
+        return [c for one in sets for c in load(one, rate, clips, split, reading)]
+    if motion in BUILTIN:
+        items = [(c.name, c.name, c) for c in builtin_clips(rate, name=motion)]
+    else:
+        path = Path(motion)
+        if not path.exists():
+            raise UserError(f"{motion}: no such file or folder; valid: {SETS}")
+        found = (f for f in path.rglob("*") if f.suffix.lower() in (".bvh", ".amc") and not f.is_dir())
+        files = sorted(found) if path.is_dir() else [path]
+        if not files:
+            raise UserError(f"{motion}: a folder without motion; valid: one that holds .bvh or .amc files")
+        meant = all(map(is_amc, files)) and split not in ("body", "all")
+        if meant:
+            print(f"{motion}: only .amc files, else held out as unseen bodies; split by their numbers", file=sys.stderr)
+        items = [(f.stem, f.name if is_amc(f) and not meant else f.stem, f) for f in files]
+    matching = [(name, split_of(key), item) for name, key, item in items if fnmatchcase(name, clips)]
+    chosen = [item for _, part, item in matching if split in ("all", part)]
+    bodies = sum(part == "body" for _, part, _ in matching)
+    if split == "train" and bodies:
+        print(f"{motion}: {bodies} .amc clips left out: unseen bodies, split body", file=sys.stderr)
+    if not matching:
+        names = [name for name, _, _ in items]
+        more = f", … ({len(names)})" if len(names) > 6 else ""
+        raise UserError(f"{motion}: no clip matches {clips!r}; there are {', '.join(names[:6])}{more}")
+    if not chosen and motion not in BUILTIN and len(files) < 10 and split not in ("style", "body") and not bodies:
+        print(
+            f"{motion}: only {len(files)} clip{'s' * (len(files) > 1)}, none to hold out: {split} uses all of them",
+            file=sys.stderr,
+        )
+        chosen = [item for _, _, item in matching]
+    if not chosen:
+        found = sorted({part for _, part, _ in matching})
+        raise UserError(
+            f"{motion}: none of the {len(matching)} clips that match {clips!r} is in split {split!r}; "
+            f"they are in {' and '.join(found)}"
+        )
+    if motion in BUILTIN:
+        return chosen
+    return [resample(clip, rate) for clip in read_clips(chosen, reading, files)]
+
+
+def sequences(
+    motion="builtin", split="train", clips="*", rate=CONTROL_RATE, seed=0, limit=0.15, verbose=True, reading=AS_IT_IS
+) -> list[Clip]:
+    """Stitched sequences of a data set: what training and measuring use.  Test:
+    tests/mocap/test_mocap.py::test_sequences.
+
+    Of several sets each is stitched by itself.
+    A set of which nothing can be joined into a sequence comes back as its single clips, and says so; one clip alone,
+    a user's recording, is not looped.
+    """
+    if len(sets := parts(motion)) > 1:
+        return [c for one in sets for c in sequences(one, split, clips, rate, seed, limit, verbose, reading)]
+    single = load(motion, rate, clips, split, reading)
+    if len(single) == 1:
+        if verbose:
+            print(f"{motion} [{split}] one clip, {single[0].seconds:.1f} s, as it is")
+        return single
+    return _sequences(single, f"{motion} [{split}]", seed, limit, verbose)
+
+
+def _sequences(single, title, seed=0, limit=0.15, verbose=True):
+    out, report = stitch(single, np.random.default_rng(seed), limit=limit)
+    if verbose:
+        result = str(report) if out else "too few to join: single clips are used"
+        print(f"{title} {len(single)} clips, {sum(c.seconds for c in single) / 60:.1f} min -> {result}")
+    return out or list(single)
+
+
+def from_bvh(path, reading=AS_IT_IS) -> Clip:
+    """Read a BVH as the canonical human, at the file's own rate.
+
+    Symbols   p = u·P(p_file), q = q_up q_file C: unit u, axes P and q_up, calibration C of the rig
+    Frame     world, floor at z = 0, metres
+    Raises    UserError: cannot be opened, not a BVH, or a skeleton that neither is known nor can be guessed
+    Test      tests/mocap/test_mocap.py::test_bvh_against_scipy, ::test_root_offset
+    """
+    return read_clips([path], reading)[0]
+
+
+SAMPLE = 20  # files of a folder from which an unknown rig is measured, evenly spread over the names
+
+
+def read_clips(paths, reading=AS_IT_IS, among=None) -> list[Clip]:
+    """Read files; an unknown rig is guessed and measured once for all files that share a skeleton, and printed.
+
+    Args      among : the folder's files, from which it is measured whatever is read: the parts of a split must not
+              see different axes.  Default: paths
+    Raises    UserError: as `from_bvh`, `from_amc`
+    Test      tests/mocap/test_rigs.py::test_folder_is_measured_once
+    """
+    among = list(among or paths)
+    measured, sampled = {}, None
+    out = []
+    for path in paths:
+        if is_amc(path):
+            out.append(from_amc(path))
+            continue
+        b = read(path)
+        known = None if reading.joint_map else rig_of(b)
+        if known:
+            out.append(canonical(b, *rig_for(b, reading)))
+            continue
+        key = _skeleton(b)
+        if key not in measured:
+            if sampled is None:
+                files = [f for f in among if not is_amc(f)]
+                sampled = list(filter(None, map(_read_or_none, files[:: -(-len(files) // SAMPLE)])))
+            measured[key] = rig_for(b, reading, [s for s in sampled if _skeleton(s) == key] or [b])
+        out.append(canonical(b, *measured[key]))
+    return out
+
+
+def _skeleton(b):
+    """What files of one skeleton have in common: all but the root's OFFSET."""
+    return b.names, tuple(b.parents), np.round(b.offsets[1:], 3).tobytes()
+
+
+def _read_or_none(path):
+    try:
+        return read(path)
+    except UserError:
+        return None  # told when it is its turn
+
+
+def rig_for(b: bvh.Bvh, reading=AS_IT_IS, group=None):
+    """(Rig, its name) of a file: known, or guessed and measured over a group of files of the same skeleton.
+
+    Test      tests/mocap/test_rigs.py::test_any_rig, ::test_overrides
+    """
+    known = None if reading.joint_map else rig_of(b)
+    if not known:
+        return _unknown(group or [b], reading)
+    rig, unit, up = RIGS[known], _unit("--unit", reading.unit), reading.up
+    return replace(rig, unit=unit or rig.unit, up=up or rig.up), known

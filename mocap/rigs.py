@@ -1,0 +1,473 @@
+r"""Capture rigs: which joint is which segment, and how its axes stand  [Reda23 §3.4].
+
+    known joint names ──────► RIGS, CMU_BONES        axes read off standing frames, once
+    any other names ────────► guess or joint map ──► measure: axes from positions and from the motion
+
+A rig's rest pose says nothing here (it may be a T-pose, or bones along x): for an unknown rig the axes are measured.
+
+    joint map, TOML           left out: guessed from the names
+    unit = "cm"               m, cm, mm, in, cmu (0.0254/0.45 m), or metres a unit; left out: from the body's size
+    up = "y"                  x, y, z, -x, -y or -z; left out: from where the head is
+    balls = ["LeftToe", "RightToe"]
+    [joints]
+    pelvis = "Hips"           a joint, or JOINT.end for its End Site; all 15 segments of `human.SEGMENTS`
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from human import (
+    CONTACT_HEIGHT,
+    CONTACT_SPEED,
+    FEET,
+    SEG,
+    SEGMENTS,
+    Clip,
+    linear_velocity,
+    quat_about,
+    quat_continuous,
+    quat_mul,
+    quat_rotate,
+)
+from mocap import amc, bvh
+from plumbing.cli import UserError
+
+# ------------------------------------------------------------------------------------ known rigs
+
+
+@dataclass(frozen=True)
+class Rig:
+    """How one capture skeleton maps to the canonical human.
+
+    joints : segment -> joint of the file.  pelvis is placed at the midpoint of the thighs' joints
+    axes   : segment -> (forward, left, up) in the joint's own frame when standing, each as "-z" or a vector
+    pitch  : segment -> degrees by which the joint's forward axis points down when standing; taken out
+    balls  : the joints at the balls of the feet, left and right
+    """
+
+    joints: dict
+    axes: dict
+    balls: tuple
+    pitch: dict = field(default_factory=dict)
+    unit: float = 0.01  # file unit in metres
+    signature: tuple = ()
+    up: str = "y"  # the file's axis that points up
+
+    def calibration(self, segment: str) -> np.ndarray:
+        """Constant rotation anatomical frame -> joint frame (4,).
+
+        Test      tests/mocap/test_mocap.py::test_rigs_stand_upright."""
+        cols = np.stack([_axis(a) for a in self.axes[segment]], axis=1)  # (3, 3): forward, left, up as columns
+        q = Rotation.from_matrix(cols).as_quat(scalar_first=True)
+        return quat_mul(q, quat_about(1, np.radians(-self.pitch.get(segment, 0.0))))
+
+
+def _axis(a):
+    """ "-z" -> (0, 0, -1); a vector passes through, made unit length."""
+    if isinstance(a, str):
+        v = np.zeros(3)
+        v["xyz".index(a[-1])] = -1.0 if a[0] == "-" else 1.0
+        return v
+    if not np.linalg.norm(a) > 1e-9:
+        raise ValueError("joints lie on one another, or an axis along its bone")
+    return np.asarray(a, dtype=float) / np.linalg.norm(a)
+
+
+def _frame(left, up):
+    """(forward, left, up) from a left axis made orthogonal to up.  ValueError: there is no such axis"""
+    left, up = _axis(left), _axis(up)
+    left = _axis(left - up * (left @ up))
+    return np.cross(left, up), left, up
+
+
+def _limbs(frames: dict) -> dict:
+    """Spread one frame a limb over its segments, and both sides."""
+    out = {}
+    for limb, (left_side, right_side) in frames.items():
+        for segment in {"leg": ("thigh", "shin"), "arm": ("upper_arm", "forearm", "hand"), "foot": ("foot",)}[limb]:
+            out[f"{segment}_l"], out[f"{segment}_r"] = left_side, right_side
+    return out
+
+
+# Axes were read off standing and walking frames: the bones lie along local x in both rigs, knees and elbows turn about
+# one local axis.  Pitches: the foot's bone slopes down to the ball by this much when the foot is flat; the Bandai head
+# looks down by this much in the mean over `walk_normal`, where people look ahead (ASSUMED).
+RIGS = {
+    "bandai": Rig(
+        signature=("joint_Root", "Hips", "UpperLeg_L", "LowerArm_R"),
+        joints=dict(
+            pelvis="Hips", chest="Chest", head="Head",
+            thigh_l="UpperLeg_L", shin_l="LowerLeg_L", foot_l="Foot_L",
+            thigh_r="UpperLeg_R", shin_r="LowerLeg_R", foot_r="Foot_R",
+            upper_arm_l="UpperArm_L", forearm_l="LowerArm_L", hand_l="Hand_L",
+            upper_arm_r="UpperArm_R", forearm_r="LowerArm_R", hand_r="Hand_R",
+        ),  # fmt: skip
+        balls=("Toes_L", "Toes_R"),
+        axes=dict(
+            pelvis=("z", "-y", "x"),
+            chest=("y", "z", "x"),
+            head=("y", "z", "x"),
+            **_limbs(dict(
+                leg=(("z", "y", "-x"), ("-z", "y", "x")),
+                arm=(("z", "y", "-x"), ("-z", "y", "x")),
+                foot=(("x", "y", "z"), ("-x", "y", "-z")),
+            )),
+        ),
+        pitch=dict(foot_l=39.6, foot_r=39.6, head=12.6),
+    ),
+    "lafan1": Rig(
+        signature=("Hips", "LeftUpLeg", "Spine2", "LeftForeArm", "LeftToe"),
+        joints=dict(
+            pelvis="Hips", chest="Spine2", head="Head",
+            thigh_l="LeftUpLeg", shin_l="LeftLeg", foot_l="LeftFoot",
+            thigh_r="RightUpLeg", shin_r="RightLeg", foot_r="RightFoot",
+            upper_arm_l="LeftArm", forearm_l="LeftForeArm", hand_l="LeftHand",
+            upper_arm_r="RightArm", forearm_r="RightForeArm", hand_r="RightHand",
+        ),  # fmt: skip
+        balls=("LeftToe", "RightToe"),
+        axes=dict(
+            pelvis=("y", "z", "x"),
+            chest=("y", "z", "x"),
+            head=("y", "z", "x"),
+            **_limbs(dict(
+                leg=(("y", "-z", "-x"), ("y", "-z", "-x")),
+                # the elbows' axis in the arms' frames, the mean of upper arm × forearm over the clip
+                arm=(_frame((0, 0.34, 0.94), "-x"), _frame((0, -0.38, 0.92), "-x")),
+                foot=(("x", "-z", "y"), ("x", "-z", "y")),
+            )),
+        ),
+        pitch=dict(foot_l=25.8, foot_r=25.8),
+    ),
+}  # fmt: skip
+
+# ------------------------------------------------------------------------------------ units and axes of a file
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "cmu": 0.0254 / 0.45}
+UPS = ("x", "y", "z", "-x", "-y", "-z")
+HIPS = (0.6, 1.2)  # m, height of a standing adult's hips; its ends' ratio is less than that of any two units
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a user says about files, over what is known, guessed or measured; None: nothing.
+
+    Raises    UserError: a unit or an axis that is none
+    Test      tests/mocap/test_rigs.py::test_overrides, ::test_bad_joint_maps
+    """
+
+    joint_map: str | None = None
+    unit: str | None = None
+    up: str | None = None
+
+    def __post_init__(self):
+        _unit("--unit", self.unit)
+        _up("--up", self.up)
+
+    @classmethod
+    def of(cls, options) -> Reading:
+        """The same three of a command's options."""
+        return cls(options.joint_map, options.unit, options.up)
+
+
+HELP = {  # of the flags that every command with --motion has
+    "joint_map": "TOML file that says which joint is which segment, for BVH files of rigs that are neither known nor "
+    "guessed",
+    "unit": "length unit of the BVH files: m, cm, mm, in, cmu, or metres a unit; found from the body's size by default",
+    "up": "axis of the BVH files that points up: x, y, z, or --up=-z; found from the body by default",
+}
+
+
+def _unit(where, value) -> float | None:
+    """Metres a unit."""
+    if value is None or isinstance(value, str) and value in UNITS:
+        return UNITS.get(value)
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = np.nan
+    if isinstance(value, bool) or not 1e-6 <= number <= 1e6:
+        valid = f"{', '.join(UNITS)}, or metres a unit as a number, 1e-6 to 1e6"
+        raise UserError(f"{where} {value!r} is no unit; valid: {valid}")
+    return number
+
+
+def _up(where, value) -> str | None:
+    if value is not None and value not in UPS:
+        raise UserError(f"{where} {value!r} is no axis; valid: {', '.join(UPS)}")
+    return value
+
+
+AS_IT_IS = Reading()
+
+
+@cache
+def _from_file(up: str):
+    """File axes -> ours: (permutation, signs, the same turn as a quaternion).  A cyclic permutation puts the up axis
+    last (from y up: x left, y up, z forward); an axis that points down is then turned over about ours x."""
+    k = "xyz".index(up[-1])
+    half = [(0.5, -0.5, -0.5, -0.5), (0.5, 0.5, 0.5, 0.5), (1.0, 0.0, 0.0, 0.0)][k]
+    turn, signs = np.array(half), np.ones(3)
+    if up[0] == "-":
+        turn, signs = quat_mul(np.array([0.0, 1.0, 0.0, 0.0]), turn), np.array([1.0, -1.0, -1.0])
+    return [(k + 1) % 3, (k + 2) % 3, k], signs, turn
+
+
+# ------------------------------------------------------------------------------------ reading a file
+
+
+def rig_of(b: bvh.Bvh) -> str | None:
+    """Name of the known rig whose joints the file has, or None.  Test: tests/mocap/test_mocap.py::test_unknown_rig."""
+    for name, rig in RIGS.items():
+        if set(rig.signature) | set(rig.balls) | set(rig.joints.values()) <= set(b.names):
+            return name
+    return None
+
+
+def read(path) -> bvh.Bvh:
+    """A BVH file as it stands; UserError if there is none.  Test: tests/robustness/test_cli.py::test_broken_motion."""
+    try:
+        b = bvh.read(path)
+    except bvh.BvhError as e:
+        raise UserError(str(e)) from None
+    except OSError as e:
+        raise UserError(f"{path}: {e.strerror or e}; expected a regular .bvh file") from None
+    _check_moving(path, len(b.names), b.values.shape[1])
+    return b
+
+
+def _check_moving(path, joints, values):
+    """A pose of all joints takes no more memory than its row of values is worth."""
+    if joints > 2 * values:
+        raise UserError(f"{path}: {joints} joints of which most cannot move, {values} values a frame; expected a rig")
+
+
+def is_amc(path) -> bool:
+    """Whether a path's name is an AMC file's.  Test: tests/mocap/test_amc.py::test_body_split."""
+    return Path(path).suffix.lower() == ".amc"
+
+
+FLOOR_LIMIT, BALL_HEIGHT = 0.15, 0.02  # m: beyond the one a file has no floor at 0; the other is a standing ball's
+
+
+def canonical(b: bvh.Bvh, rig: Rig, name: str) -> Clip:
+    """A file in a rig -> the canonical human.
+
+    Test      tests/mocap/test_mocap.py::test_root_offset, tests/mocap/test_rigs.py::test_floor"""
+    pose = _clip_of(b, rig, name, "replace")
+    root = b.parents.argmin()
+    if np.any(b.offsets[root]) and any("position" in c for c in b.channels[root]):
+        # Some exporters add the root's OFFSET to its channels, most do not: right is what puts the feet on the floor.
+        added = _clip_of(b, rig, name, "add")
+        if abs(_lowest(added)) < abs(_lowest(pose)):
+            pose = added
+    if name not in RIGS and abs(low := _lowest(pose)) > FLOOR_LIMIT:
+        print(f"{b.path}: the balls of the feet stand at {low:.2f} m: moved to the floor", file=sys.stderr)
+        down = np.array([0.0, 0.0, low - BALL_HEIGHT])
+        pose = replace(pose, pos=pose.pos - down, ball=pose.ball - down)
+    if (lean := _lean(pose)) > LYING:
+        print(f"{b.path}: the body is {lean:.0f} degrees off {rig.up}, taken as up; another: --up", file=sys.stderr)
+    _check_size(b.path, pose, "; its unit and up axis can be given as --unit, --up")
+    return replace(pose, body=_body(name, pose))
+
+
+LYING = 60.0  # degrees; the most that `find_up` takes for upright is 53
+
+
+def _lean(clip) -> float:
+    """Degrees between up and where the head is from the feet, in the mean.
+
+    Test      tests/mocap/test_rigs.py::test_overrides"""
+    v = (clip.pos[:, SEG["head"]] - clip.pos[:, FEET].mean(axis=1)).mean(axis=0)
+    return float(np.degrees(np.arctan2(np.hypot(v[0], v[1]), v[2])))
+
+
+HIP_HEIGHTS = (0.1, 10.0)  # m; what follows divides by the height of the hips
+
+
+def _check_size(path, clip, remedy):
+    """UserError if nobody is that small or that large."""
+    if not HIP_HEIGHTS[0] <= clip.hip_height <= HIP_HEIGHTS[1]:
+        valid = f"{HIP_HEIGHTS[0]:g} to {HIP_HEIGHTS[1]:g} m{remedy}"
+        raise UserError(f"{path}: the hips are {clip.hip_height:.3g} m above the floor; valid: {valid}")
+
+
+def _body(rig: str, clip: Clip) -> str:
+    """Whose body: the rig and the lengths of leg and arm [cm], so that two people in one rig are two bodies."""
+    leg = clip.limb("thigh_l", "shin_l") + clip.limb("shin_l", "foot_l")
+    arm = clip.limb("upper_arm_l", "forearm_l") + clip.limb("forearm_l", "hand_l")
+    return f"{rig}-leg{100 * leg:.0f}-arm{100 * arm:.0f}"
+
+
+def _lowest(clip):
+    return np.percentile(clip.ball[..., 2].min(axis=1), 20)
+
+
+def _pose(b, root_offset="replace"):
+    """Names, positions and rotations of joints and, as JOINT.end, of End Sites.  File units and axes."""
+    pos, quat = bvh.global_pose(b, root_offset)
+    index = {n: j for j, n in enumerate(b.names)}
+    at = [index[n] for n in b.end_sites]
+    ends = pos[:, at] + quat_rotate(quat[:, at], np.array(list(b.end_sites.values())).reshape(-1, 3))
+    names = (*b.names, *(f"{n}.end" for n in b.end_sites))
+    return names, np.concatenate([pos, ends], axis=1), np.concatenate([quat, quat[:, at]], axis=1)
+
+
+def _clip_of(b, rig, name, root_offset):
+    calibrations = np.stack([rig.calibration(s) for s in SEGMENTS])
+    if any(n.endswith(".end") for n in (*rig.joints.values(), *rig.balls)):
+        pose = _pose(b, root_offset)
+    else:
+        pose = (b.names, *bvh.global_pose(b, root_offset))
+    return _human(rig, calibrations, *pose, Path(b.path).stem, name, 1.0 / b.frame_time)
+
+
+def _human(rig, calibrations, names, pos, quat, clip, body, rate):
+    """The canonical human in a file's joints (file units and axes)."""
+    index = {n: i for i, n in enumerate(names)}
+    cols = [index[rig.joints[s]] for s in SEGMENTS]
+    order, signs, turn = _from_file(rig.up)
+    p = pos[..., order] * (signs * rig.unit)
+    q = quat_mul(turn, quat_mul(quat[:, cols], calibrations))
+    joint_pos = p[:, cols].copy()
+    joint_pos[:, 0] = 0.5 * (joint_pos[:, SEG["thigh_l"]] + joint_pos[:, SEG["thigh_r"]])
+    ball = p[:, [index[n] for n in rig.balls]]
+    return Clip(clip, body, rate, joint_pos, quat_continuous(q), ball)
+
+
+# ------------------------------------------------------------------------------------ CMU
+
+# CMU's skeletons: the same bones and zero pose for every subject, lengths and some directions of their own.  The head's
+# joint is where `head` starts: 9 cm below the headband, as in a skull.  The forearm is `radius` and `wrist` together:
+# `wrist` only pronates, and `hand` flexes.  `thorax` starts in the middle of the back.
+CMU_BONES = dict(
+    pelvis="root", chest="thorax", head="head",
+    thigh_l="lfemur", shin_l="ltibia", foot_l="lfoot", thigh_r="rfemur", shin_r="rtibia", foot_r="rfoot",
+    upper_arm_l="lhumerus", forearm_l="lradius", hand_l="lhand",
+    upper_arm_r="rhumerus", forearm_r="rradius", hand_r="rhand",
+)  # fmt: skip
+# Degrees, means over subjects 07, 08, 16, 35.  In straight walks the head looks down by 15 (10 to 18), and people look
+# ahead (ASSUMED).  With ankle and ball both slower than 0.25 m/s the sole, square to the shank in the zero pose, points
+# down by 2.9 (1.9 to 5.0).
+CMU_PITCH = dict(head=15.0, foot_l=2.9, foot_r=2.9)
+INCH = 0.0254  # m; CMU's unit is 1 / (:units length) inches
+AMC_RATE = 120.0  # Hz of CMU's AMC files, which do not say it
+
+
+def cmu_rig(skeleton: amc.Skeleton) -> Rig:
+    r"""The rig of a CMU skeleton, from its zero pose: a T-pose with splayed legs, all bones' frames being the file's.
+
+    Method    up: against the bone (thigh, shin, arm, hand), the file's y (trunk, head), the shin's (foot).
+              left: the knee's axis, with which the shin bends back, for the leg; against the elbow's axis, with which
+              the forearm bends forward, for upper arm and forearm; in the hand the T-pose's palms face down and the
+              thumbs forward, so left is up (left hand) or down.  Knee and elbow turn about x of their `axis`
+    Frame     of the file: x left, y up, z forward
+    Raises    UserError: bones are missing, or a knee or an elbow has no rx; names them
+    Test      tests/mocap/test_amc.py::test_zero_pose_is_a_t_pose, ::test_cmu_anatomy, ::test_unknown_skeleton
+    """
+    index = {n: i for i, n in enumerate(skeleton.names)}
+    wanted = {*CMU_BONES.values(), "ltoes", "rtoes"}
+    hinges = {"ltibia", "rtibia", "lradius", "rradius"}
+    missing = sorted(wanted - set(index)) or sorted(n for n in hinges if "rx" not in skeleton.dofs[index[n]])
+    if missing:
+        raise UserError(
+            f"{skeleton.path}: no CMU skeleton: {', '.join(missing)} missing or without rx; "
+            f"it has {bvh.listed(skeleton.names)}"
+        )
+
+    def hinge(name):
+        i = index[name]
+        return Rotation.from_euler(skeleton.axis_orders[i], skeleton.axes[i]).apply([1.0, 0.0, 0.0])
+
+    axes = dict.fromkeys(("pelvis", "chest", "head"), _frame("x", "y"))
+    for side, palm in (("l", "y"), ("r", "-y")):
+        up = {s: -skeleton.directions[index[side + s]] for s in ("femur", "tibia", "humerus", "radius", "hand")}
+        knee, elbow = hinge(f"{side}tibia"), -hinge(f"{side}radius")
+        axes[f"thigh_{side}"], axes[f"shin_{side}"] = _frame(knee, up["femur"]), _frame(knee, up["tibia"])
+        axes[f"foot_{side}"] = axes[f"shin_{side}"]
+        axes[f"upper_arm_{side}"], axes[f"forearm_{side}"] = _frame(elbow, up["humerus"]), _frame(elbow, up["radius"])
+        axes[f"hand_{side}"] = _frame(palm, up["hand"])
+    return Rig(CMU_BONES, axes, ("ltoes", "rtoes"), CMU_PITCH, INCH / skeleton.length)
+
+
+def from_amc(path, rate=AMC_RATE) -> Clip:
+    """Read a CMU motion as the canonical human; its skeleton lies beside it.
+
+    Symbols   as in `from_bvh`; unit 0.0254 / (:units length) m; the balls of the feet are where the toes start
+    Frame     world, floor at z = 0, metres; made level by `level`
+    Args      path : SUBJECT_TRIAL.amc beside SUBJECT.asf, or beside a single .asf of any name
+              rate : [Hz] of the file, which does not hold it; CMU's are 120
+    Returns   Clip at that rate, body cmu-SUBJECT with lengths of leg and arm
+    Raises    UserError: cannot be opened, malformed, no skeleton beside it, or not CMU's; names what was looked for
+    Test      tests/mocap/test_amc.py::test_from_amc_against_matrices, ::test_skeleton_beside, ::test_cmu_anatomy
+    """
+    s, motion = read_amc(path)
+    try:
+        rig = cmu_rig(s)
+    except ValueError as e:
+        raise UserError(f"{s.path}: the axes of its bones make no frame: {e}; expected CMU's bones") from None
+    calibrations = np.stack([rig.calibration(segment) for segment in SEGMENTS])
+    pose = amc.global_pose(s, motion)
+    clip = level(_human(rig, calibrations, s.names, *pose, Path(path).stem, "", float(rate)))
+    _check_size(path, clip, f"; the unit is that of {Path(s.path).name}: 1 / (length of :units) inches")
+    return replace(clip, body=_body(f"cmu-{Path(s.path).stem}", clip))
+
+
+LEVEL_SPREAD, LEVEL_LIMIT = 0.2, 3.0  # m; degrees
+
+
+def level(clip: Clip) -> Clip:
+    r"""The clip turned about the origin so that the floor under its standing feet is level.
+
+    Why       the floor of CMU's subjects 07 and 08 rises by 1.8 to 2.1 cm a metre: 6 cm from end to end of a walk
+    Equation  g = argmin mean_i (h_i − g·x_i)² + s² |g|²; h_i, x_i: height and place of a standing ball, both less that
+              foot's means.  s = 0.2 m: where the feet spread less than that, as across a straight walk, g stays 0.
+              Then a turn by atan |g| about (−g_y, g_x, 0)
+    ASSUMED   the floor is a plane through the capture's origin: there the balls of all four subjects stand 3 to 5 cm
+              high.  More than 3 degrees are stairs or a ramp, which stay
+    Test      tests/mocap/test_amc.py::test_level, ::test_cmu_floor
+    """
+    standing = (clip.ball[..., 2] < CONTACT_HEIGHT) & (
+        np.linalg.norm(linear_velocity(clip.ball, clip.rate), axis=-1) < CONTACT_SPEED
+    )
+    feet = [clip.ball[standing[:, k], k] for k in (0, 1) if standing[:, k].any()]
+    if not feet:
+        return clip
+    d = np.concatenate([f - f.mean(axis=0) for f in feet])
+    x, h = d[:, :2], d[:, 2]
+    g = np.linalg.solve(x.T @ x / len(x) + LEVEL_SPREAD**2 * np.eye(2), x.T @ h / len(x))
+    steep = np.linalg.norm(g)
+    angle = np.arctan(steep)
+    if not 0.0 < angle < np.radians(LEVEL_LIMIT):
+        return clip
+    q = np.array([np.cos(angle / 2), *np.sin(angle / 2) / steep * np.array([-g[1], g[0], 0.0])])
+    return replace(clip, pos=quat_rotate(q, clip.pos), ball=quat_rotate(q, clip.ball), quat=quat_mul(q, clip.quat))
+
+
+def read_amc(path):
+    """Skeleton and motion of an .amc file."""
+    path = Path(path)
+    beside = sorted(f for f in path.parent.glob("*") if f.suffix.lower() == ".asf")
+    subject = path.stem.rpartition("_")[0] or path.stem
+    skeleton = [f for f in beside if f.stem == subject] or beside
+    try:
+        if path.exists() and len(skeleton) != 1:
+            found = ", ".join(f.name for f in beside[:6]) or "none"
+            raise UserError(
+                f"{path}: no skeleton beside it: looked for {subject}.asf or a single .asf in {path.parent}; "
+                f"there is {found}"
+            )
+        s = amc.read_asf(skeleton[0]) if skeleton else None
+        motion = amc.read_amc(path, s)
+        _check_moving(s.path, len(s.names), len(s.columns))
+        return s, motion
+    except amc.AmcError as e:
+        raise UserError(str(e)) from None
+    except OSError as e:
+        raise UserError(f"{e.filename or path}: {e.strerror or e}; expected a regular file") from None

@@ -1,0 +1,1 @@
+"""What is not the subject: command lines, safe readers, run folders, pictures."""

@@ -1,0 +1,215 @@
+"""plumbing.files."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import stat
+import tomllib
+from pathlib import Path
+
+import numpy as np
+
+from plumbing.cli import UserError
+
+# ---- files that are whole or absent ---------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def atomic_path(path, previous=None):
+    """Yield a temporary path beside `path` (same suffix); rename it on success, remove it on any exception.
+
+    Args      path : the final file; previous : where an existing file is kept, or None to replace it
+    Test      tests/plumbing/test_runs.py::test_atomic_write
+    """
+    path = Path(path)
+    temporary = path.with_name(f"{path.stem}.tmp-{os.getpid()}-{os.urandom(3).hex()}{path.suffix}")
+    try:
+        yield temporary
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        if previous is not None and path.exists():
+            os.replace(path, previous)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def atomic_write(path, content, previous=None):
+    """Write a whole file or none of it.
+
+    Args      path : final file; content : bytes, str, or a function that is given the open binary file
+              previous : where an existing file is kept, or None
+    Raises    UserError: the folder is missing or cannot be written
+    Test      tests/plumbing/test_runs.py::test_atomic_write
+    """
+    try:
+        with atomic_path(path, previous) as temporary, open(temporary, "wb") as file:
+            if callable(content):
+                content(file)
+            else:
+                file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(f"cannot write {path}: {reason}; give a folder that exists and is writable") from None
+
+
+def check_folders(*paths, read=()) -> None:
+    """Before the slow work: the files to write, None left out, have a folder and destroy nothing.
+
+    Args      read : files and folders that are read, None left out
+    Raises    UserError: no such folder; the file is one of those read, or motion in a folder of them; it is read-only
+    Test      tests/robustness/test_cli.py::test_folder_to_write, test_nothing_read_is_overwritten
+    """
+    for out in filter(None, paths):
+        file = Path(out).resolve()
+        if not file.parent.is_dir():
+            raise UserError(f"cannot write {out}: there is no folder {Path(out).parent}")
+        for source in (Path(s).resolve() for s in read if s):
+            inside = source in file.parents and source.is_dir() and file.suffix.lower() in (".bvh", ".amc", ".asf")
+            if file == source or (inside and file.exists()):
+                raise UserError(f"cannot write {out}: it is read from; give another file")
+        if file.is_file() and not file.stat().st_mode & 0o222:
+            raise UserError(f"cannot write {out}: it is read-only; give another file")
+
+
+# ---- files from outside ---------------------------------------------------------------------------------------------
+
+TOML_BYTES, TOML_LINE = 65536, 1000  # tomllib's time and memory grow with the square of the dots in a key
+NESTING = 16  # tables and arrays inside one another: no file of ours has more than 4
+INTEGER = 60  # digits; a generator's state has 39
+
+
+KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
+
+
+def kind_of(path) -> str | None:
+    """What there is that is no regular file: "a folder", "a pipe", "a device", "a socket"; None for a regular one.
+
+    Raises    OSError: nothing there, or not to be seen; ValueError: a name that none can have
+    Test      tests/plumbing/test_runs.py::test_regular_files
+    """
+    kind = stat.S_IFMT(os.stat(path).st_mode)
+    return None if kind == stat.S_IFREG else KINDS.get(kind, "a socket")
+
+
+def open_regular(path):
+    """A regular file, open for its bytes.  What else has a name may hang (a pipe) or have no end (/dev/zero).
+
+    Raises    OSError: it cannot be opened, or `strerror` says what it is; ValueError: as `kind_of`
+    Test      tests/plumbing/test_runs.py::test_regular_files
+    """
+    if kind := kind_of(path):
+        raise OSError(errno.EINVAL, f"is {kind}", os.fspath(path))
+    return open(path, "rb")
+
+
+def read_text(path, expected, limit=None) -> str:
+    """A whole text file.
+
+    Args      path : file, UTF-8 with or without a byte order mark; expected : what it should be, for the message
+              limit : bytes, or None
+    Raises    UserError: no regular file, cannot be opened, longer than the limit, or another encoding
+    Test      tests/plumbing/test_runs.py::test_read_text, test_regular_files
+    """
+    try:
+        with open_regular(path) as file:
+            data = file.read(-1 if limit is None else limit + 1)
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"cannot read {path}: {getattr(error, 'strerror', None) or error}; expected {expected}"
+        ) from None
+    if limit is not None and len(data) > limit:
+        raise UserError(f"{path}: longer than {limit} bytes; expected {expected}")
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise UserError(f"{path}: UTF-16 text; expected {expected}, in UTF-8 (save it again in that encoding)")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise UserError(
+            f"{path}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8; expected {expected}"
+        ) from None
+
+
+def read_toml(path, expected) -> dict:
+    """The tables of a TOML file; time and memory follow its size.
+
+    Args      path : file; expected : what it should be, for the message
+    Raises    UserError: cannot be opened, no TOML (with line and column), or nested too deep
+    Test      tests/plumbing/test_runs.py::test_read_toml, tests/robustness/test_fuzz.py::test_joint_maps
+    """
+    text = read_text(path, expected, TOML_BYTES)
+    for number, line in enumerate(text.split("\n"), 1):
+        if len(line) > TOML_LINE:
+            raise UserError(f"{path}, line {number}: longer than {TOML_LINE} characters; expected {expected}")
+    try:
+        table = tomllib.loads(text)
+        _check_nesting(table)
+    except RecursionError:
+        raise UserError(f"{path}: nested more than {NESTING} deep; expected {expected}") from None
+    except ValueError as error:
+        raise UserError(f"{path}: no TOML: {error}; expected {expected}") from None
+    return table
+
+
+def parse_json(text):
+    """JSON without what it does not have: NaN, infinity, a key twice; nor numbers or nesting beyond any use.
+
+    Raises    ValueError: what it is and, where known, where
+    Test      tests/plumbing/test_runs.py::test_parse_json, tests/robustness/test_fuzz.py::test_run_folders
+    """
+
+    def pairs(items):
+        table = dict(items)
+        if len(table) < len(items):
+            raise ValueError(f"key {_twice(name for name, _ in items)[:40]!r} is there twice; valid: once")
+        return table
+
+    def finite(word):
+        if not np.isfinite(float(word)):
+            raise ValueError(f"{word[:40]} is no finite number")
+        return float(word)
+
+    def integer(word):
+        if len(word) > INTEGER:
+            raise ValueError(f"an integer of {len(word)} digits; valid: at most {INTEGER}")
+        return int(word)
+
+    try:
+        value = json.loads(text, object_pairs_hook=pairs, parse_float=finite, parse_int=integer, parse_constant=finite)
+        _check_nesting(value)
+    except RecursionError:
+        raise ValueError(f"nested more than {NESTING} deep") from None
+    return value
+
+
+def _check_nesting(tree):
+    """RecursionError if dicts and lists lie more than NESTING deep in one another."""
+    level = [tree]
+    for _ in range(NESTING):
+        level = [v for each in level if isinstance(each, dict | list) for v in _values(each)]
+        if not level:
+            return
+    if any(isinstance(v, dict | list) for v in level):
+        raise RecursionError
+
+
+def _twice(names):
+    """The first of the names that is there again."""
+    seen = set()
+    return next(name for name in names if name in seen or seen.add(name))
+
+
+def _values(tree):
+    return tree.values() if isinstance(tree, dict) else tree
+
+
+def parse_number(word) -> float:
+    """float(word), but without Python's own 1_000.  ValueError: no number"""
+    if "_" in word:
+        raise ValueError(f"{word[:40]!r} is no number")
+    return float(word)

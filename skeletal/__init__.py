@@ -1,0 +1,1 @@
+"""Skeleton-aware networks: unpaired retargeting between skeletons (Aberman et al. 2020)."""

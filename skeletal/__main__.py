@@ -1,0 +1,7 @@
+"""Skeleton-aware networks on the command line: python -m skeletal train | autoencode | retarget | measure."""
+
+from plumbing.cli import run_main
+from skeletal.play import main
+
+if __name__ == "__main__":
+    run_main(main)

@@ -1,0 +1,847 @@
+r"""Every reader against damaged files: it loads what is whole, or says in one line what is wrong with which file.
+
+A small valid file of every kind is cut, spliced, renamed, doubled, encoded anew, given numbers that are none, counts
+that are not true, nesting without end; or replaced by any bytes.  For each input one of two things must happen:
+
+- it loads, and then all it holds is finite and fits together: a clip can be retargeted, a policy acts, a stream drives;
+- it raises `plumbing.cli.UserError`, whose message is one printable line that names the file and what would be valid.
+
+No other exception, no warning, no hang, no memory beyond a multiple of the file's size, and no file changed.
+
+    python -m pytest tests/robustness/test_fuzz.py                         some hundred inputs a reader, always the same
+    FUZZ_EXAMPLES=10000 python -m pytest tests/robustness/test_fuzz.py     10,000 inputs in all; prints how many of
+    which reader
+    FUZZ_EXAMPLES=10000 FUZZ_SEED=1 python -m pytest tests/robustness/test_fuzz.py     10,000 others
+"""
+
+import contextlib
+import copy
+import io
+import json
+import os
+import re
+import signal
+import struct
+import sys
+import tracemalloc
+import warnings
+import zipfile
+import zlib
+from collections import Counter
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
+from test_amc import cmu_file
+from test_amc import standing as cmu_standing
+from test_mocap import walk, write_as
+from test_rigs import write_rig
+from test_stream import standing, to_csv
+
+import character
+import ppo
+import retarget
+from env import Env
+from headset import calibration
+from headset.player import Player
+from headset.reader import AXES, Reader, lines_of
+from human import sensors
+from mocap import inspect, rigs
+from mocap.data import load
+from mocap.rigs import Reading
+from plumbing import runs
+from plumbing.cli import MESSAGE, UserError
+
+resource = pytest.importorskip("resource", reason="this system cannot limit a process's memory")
+
+EXAMPLES, SEED = os.environ.get("FUZZ_EXAMPLES"), int(os.environ.get("FUZZ_SEED", 0))
+SHARES = dict(  # of the inputs
+    test_bvh=15, test_asf_and_amc=15, test_joint_maps=8, test_character_tables=13, test_character_models=13,
+    test_policies=14, test_run_folders=13, test_headset_files=5, test_standard_input=4,
+)  # fmt: skip
+DEADLINE = 10.0  # s of processor time for one input
+ROOM, TIMES = 32 * 2**20, 400  # bytes of memory: for any input, and for each byte of its files
+MEASURED = 8  # one input in so many has its memory measured, which is slow; of the others the address space is limited
+VALID = re.compile(r"\b(valid|expected|needed|needs|must|give|set|write|fill in|it has|there (are|is)|is not an?)\b")
+
+
+# ---------------------------------------------------------------- one input
+
+
+@dataclass
+class Input:
+    """A folder's files, and which of them is damaged."""
+
+    files: dict
+    damaged: str = ""
+
+    def __repr__(self):
+        raw = self.files.get(self.damaged, b"")
+        return f"{self.damaged} of {len(raw)} bytes: {raw[:200]!r}"
+
+    def write(self, folder):
+        """A folder with exactly these files."""
+        folder.mkdir(exist_ok=True)
+        for old in folder.iterdir():
+            old.unlink()
+        for name, raw in self.files.items():
+            (folder / name).write_bytes(raw)
+
+
+@contextlib.contextmanager
+def limited(size, measured):
+    """No more than the deadline, memory for `size` bytes of files, and no warning."""
+
+    def late(*_):
+        raise TimeoutError(f"more than {DEADLINE} s")
+
+    room, peak = ROOM + TIMES * size, 0
+    pages = int(Path("/proc/self/statm").read_text().split()[0]) if sys.platform == "linux" else None
+    old, handler = resource.getrlimit(resource.RLIMIT_AS), signal.signal(signal.SIGPROF, late)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        if measured:
+            tracemalloc.start()
+        elif pages:
+            most = pages * resource.getpagesize() + 2 * room + 2**30  # threads' stacks are a part of it
+            resource.setrlimit(resource.RLIMIT_AS, (most, old[1]))
+        signal.setitimer(signal.ITIMER_PROF, DEADLINE)
+        try:
+            yield
+            peak = tracemalloc.get_traced_memory()[1] if measured else 0
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
+            signal.signal(signal.SIGPROF, handler)
+            tracemalloc.stop()
+            resource.setrlimit(resource.RLIMIT_AS, old)
+    assert peak <= room, f"{peak / 2**20:.0f} MiB of memory for {size} bytes"
+
+
+def contents(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+
+
+def attempt(read, folder, measured=False, source=None, written=()):
+    """Read a folder's files: True if they load, False if they are refused as they should be; or what broke out.
+
+    source : what a message must name, one of the files by default; written : files that reading may change"""
+    before, said, told = contents(folder), None, io.StringIO()
+    size = sum(map(len, before.values()))
+    with limited(size, measured), contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+        try:
+            read(folder)
+        except UserError as error:
+            said = str(error)
+    assert len(told.getvalue()) < 20_000 + 100 * size
+    if said is None:
+        return True
+    assert len(said.splitlines()) == 1 and said.isprintable() and len(said) <= MESSAGE, said
+    names = [source] if source else [p.name for p in folder.iterdir()]
+    assert any(name in said for name in names), f"names no file: {said}"
+    assert VALID.search(said), f"says not what would be valid: {said}"
+    assert contents(folder) == before, "changed its files"
+    return False
+
+
+def finite(thing, what="it"):
+    """Every number in arrays, tables and lists."""
+    if isinstance(thing, np.ndarray | np.generic | float):
+        assert np.asarray(thing).dtype.kind not in "fc" or np.isfinite(thing).all(), what
+    elif isinstance(thing, dict):
+        for key, value in thing.items():
+            finite(value, f"{what}.{key}")
+    elif isinstance(thing, list | tuple):
+        for value in thing:
+            finite(value, what)
+
+
+@pytest.fixture
+def fuzz(tmp_path, capsys, request, monkeypatch):
+    """fuzz(valid, read, targets, source): many damaged copies of valid folders, each read."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log where it runs
+    name, tally = request.node.name, Counter()
+
+    def run(valid, read, targets, source=None):
+        """valid : folders, as {file: bytes}; read : function of a folder; targets : file -> strategy of damage to it"""
+        count = round(int(EXAMPLES or 1300) * SHARES[name] / sum(SHARES.values()))
+        folder = tmp_path / "fuzzed"
+        for files in valid:
+            Input(files).write(folder)
+            assert attempt(read, folder, True, source), "the undamaged files do not load"
+        strategies = [{name: damage(files[name]) for name, damage in targets.items()} for files in valid]
+
+        @st.composite
+        def inputs(draw):
+            kind = draw(st.integers(0, len(valid) - 1))
+            damaged = draw(st.sampled_from(sorted(targets)))
+            return Input(valid[kind] | {damaged: draw(strategies[kind][damaged])}, damaged)
+
+        @seed(SEED)
+        @settings(max_examples=count, deadline=None, database=None, suppress_health_check=list(HealthCheck),
+                  phases=(Phase.generate, Phase.shrink))  # fmt: skip
+        @given(inputs())
+        def one(it):
+            it.write(folder)
+            tally["inputs"] += 1
+            measured = zlib.crc32(it.files[it.damaged]) % MEASURED == 0
+            tally["loaded"] += attempt(read, folder, measured, source)
+
+        one()
+        assert 0 < tally["loaded"] < tally["inputs"] >= count
+        if EXAMPLES:
+            with capsys.disabled():
+                print(f"\n{name}: {tally['inputs']} inputs, {tally['loaded']} of them loaded ", end="")
+
+    return run
+
+
+# ---------------------------------------------------------------- damage
+
+NUMBERS = [
+    b"nan", b"inf", b"-inf", b"1e308", b"-1e308", b"1e999", b"1e-308", b"0", b"-1", b"0.5", b"1000000", b"9" * 5000,
+    b"1000000000000", b"-1000000000000", b"99999999999999999999999", b"1_000", b"1,5", b"0x1F", b"--3", b"+",
+    "\u0661".encode(), b"", b"1e9", b"-180", b"true",
+]  # fmt: skip
+PIECES = [
+    b"", b"{", b"}", b"[", b"]", b'"', b"'", b"=", b"#", b",", b":", b"\\", b"\n", b"\r", b"\t", b"\0", b"\xff", b"<",
+    b">", b"&#0;", b"\x1b[2J", b"\xef\xbb\xbf", b"end", b"root", b"z" * 3000, "\u2028".encode(), b"\xe9", b"[" * 2000,
+    b"{" * 500, b"a." * 400 + b"a=1\n", b'{"a":' * 2000,
+]  # fmt: skip
+NUMBER, WORD = rb"(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?(?![\w.])", rb"[A-Za-z_]\w*"
+
+
+def cut(draw, raw):
+    return raw[: draw(st.integers(0, len(raw)))]
+
+
+def splice(draw, raw):
+    at = draw(st.integers(0, len(raw)))
+    return raw[:at] + draw(st.sampled_from(PIECES) | st.binary(max_size=8)) + raw[at + draw(st.integers(0, 40)) :]
+
+
+def exchange(draw, raw, pattern, others):
+    """One of what matches, replaced."""
+    found = list(re.finditer(pattern, raw))
+    if not found:
+        return raw
+    one = found[draw(st.integers(0, len(found) - 1))]
+    return raw[: one.start()] + draw(st.sampled_from(others)) + raw[one.end() :]
+
+
+def number(draw, raw):
+    return exchange(draw, raw, NUMBER, NUMBERS)
+
+
+def rename(draw, raw):
+    """A word becomes another of the file's: joints, keys and columns of another name, and there twice."""
+    return exchange(draw, raw, WORD, sorted(set(re.findall(WORD, raw))) or [b"a"])
+
+
+def lines(draw, raw):
+    """Lines gone, doubled, moved, repeated very often."""
+    rows = raw.split(b"\n")
+    a, b = (draw(st.integers(0, len(rows) - 1)) for _ in range(2))
+    small = len(raw) < 2**18  # what was repeated 500 times is not repeated so again: memory
+    what = draw(st.sampled_from(["gone", "span", "swap", "double", *(["often", "long"] if small else [])]))
+    if what == "gone":
+        del rows[a]
+    elif what == "span":
+        del rows[min(a, b) : max(a, b)]
+    elif what == "swap":
+        rows[a], rows[b] = rows[b], rows[a]
+    elif what == "double":
+        rows.insert(b, rows[a])
+    elif what == "often":
+        rows[a:a] = [rows[b]] * 500
+    else:
+        rows[a] = rows[a] * 500
+    return b"\n".join(rows)
+
+
+def encoding(draw, raw):
+    codes = ("utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-8-sig", "utf-7", "cp500")
+    how = draw(st.sampled_from([*codes, "crlf", "cr", "upper", "no end", "spaces"]))
+    if how in codes:
+        return raw.decode("latin-1").encode(how)
+    return {"crlf": raw.replace(b"\n", b"\r\n"), "cr": raw.replace(b"\n", b"\r"), "upper": raw.upper(),
+            "no end": raw.rstrip(), "spaces": raw.replace(b" ", b"\t \t")}[how]  # fmt: skip
+
+
+MOVES = (cut, splice, splice, number, number, number, rename, rename, lines, lines, encoding)
+
+
+@st.composite
+def damaged(draw, raw, *more):
+    """Damage to a text, mostly once, else two or three times; now and then any bytes at all."""
+    if not draw(st.integers(0, 29)):
+        return draw(st.binary(max_size=300))
+    for _ in range(draw(st.sampled_from((1, 1, 1, 2, 3)))):
+        raw = draw(st.sampled_from([*MOVES, *more]))(draw, raw)
+    return raw
+
+
+def inserting(text):
+    """A move that puts a text between two lines."""
+
+    def insert(draw, raw):
+        rows = raw.split(b"\n")
+        at = draw(st.integers(0, len(rows)))
+        return b"\n".join([*rows[:at], text, *rows[at:]])
+
+    return insert
+
+
+# ---------------------------------------------------------------- motion
+
+
+@pytest.fixture(scope="module")
+def jesse():
+    return character.load("jesse")
+
+
+def check_clip(clip, char):
+    """Shapes, numbers, and what is made of it."""
+    n = len(clip)
+    assert n and clip.pos.shape == (n, 15, 3) and clip.quat.shape == (n, 15, 4) and clip.ball.shape == (n, 2, 3)
+    finite([clip.pos, clip.quat, clip.ball, clip.rate])
+    np.testing.assert_allclose(np.linalg.norm(clip.quat, axis=-1), 1.0, atol=1e-6)
+    pose = retarget.retarget(char, clip)
+    finite([pose.qpos, pose.qvel, *sensors(clip)])
+
+
+def reading_motion(char, name, joint_map=None):
+    """What every command does with --motion FILE."""
+
+    def read(folder):
+        reading = Reading(str(folder / joint_map) if joint_map else None)
+        for clip in load(folder / name, split="all", reading=reading):
+            check_clip(clip, char)
+            inspect.describe(clip)
+
+    return read
+
+
+def chain(joints, channels="CHANNELS 3 Zrotation Xrotation Yrotation"):
+    """A BVH of joints in one chain."""
+    opened = "\n".join(f"{'JOINT' if k else 'ROOT'} j{k} {{ OFFSET 0 1 0 {channels}" for k in range(joints))
+    values = "0 " * int(channels.split()[1]) * joints
+    return f"HIERARCHY\n{opened}{'}' * joints}\nMOTION\nFrames: 1\nFrame Time: 0.1\n{values}\n".encode()
+
+
+@pytest.fixture(scope="module")
+def bvh_files(tmp_path_factory):
+    """The same walk in two rigs that are known and three that are guessed: rig -> bytes."""
+    path, clip, out = tmp_path_factory.mktemp("bvh") / "take.bvh", walk(0.15), {}
+    for rig in ("bandai", "lafan1", "mixamo", "smpl", "xsens"):
+        write_as(path, rig, clip) if rig in rigs.RIGS else write_rig(path, clip, rig)
+        out[rig] = re.sub(rb"(\.\d{4})\d+", rb"\1", path.read_bytes())
+    return out
+
+
+JOINT_MAP = b"""# a map
+unit = "cm"
+up = "y"
+balls = ["LeftToe", "RightToe"]
+[joints]
+pelvis = "Hips"
+head = 'Head'
+thigh_l = "LeftHip"
+hand_r = "RightWrist"
+"""
+
+
+@pytest.fixture(scope="module")
+def cmu_files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cmu")
+    cmu_file(folder, [cmu_standing()] * 3)
+    return {name: (folder / name).read_bytes() for name in ("16.asf", "16_01.amc")}
+
+
+# ---------------------------------------------------------------- characters
+
+
+def read_character(folder):
+    """What every command does with --character FILE."""
+    char = character.load(folder / "mini.toml")
+    finite({f.name: getattr(char, f.name) for f in fields(char) if f.name not in ("ranges", "model")})
+    assert char.hip_height > 0 and not np.isnan(char.ranges).any()
+    m = char.model
+    finite([m.qpos0, m.body_mass, m.body_inertia, m.body_pos, m.geom_size, m.jnt_range, m.actuator_gear])
+    kinematics = retarget.forward_kinematics(char, m.qpos0)
+    finite([kinematics.xpos, kinematics.xquat, kinematics.lowest])
+
+
+MINI = {"mini.xml": b"""<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <default><geom contype="0" conaffinity="1" mass="1"/><joint range="-1.5 1.5"/></default>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1" contype="1" conaffinity="0"/>
+    <body name="hips" pos="0 0 0.5"><freejoint/><geom size="0.1"/>
+      <body name="skull" pos="0 0 0.3"><joint name="head_y" axis="0 -1 0"/><joint name="head_z" axis="0 0 1"/>
+        <geom type="box" size="0.05 0.06 0.07"/><site name="eyes"/></body>
+      <body name="left" pos="0 0.1 -0.1"><joint name="leg_l_y" axis="0 1 0"/>
+        <geom type="capsule" size="0.02" fromto="-0.1 0 -0.3 0.1 0 -0.3"/><site name="a"/></body>
+      <body name="right" pos="0 -0.1 -0.1"><joint name="leg_r_y" axis="0 1 0"/>
+        <geom type="capsule" size="0.02" fromto="-0.1 0 -0.3 0.1 0 -0.3"/><site name="b"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="leg_l_y"/><motor joint="leg_r_y"/><motor joint="head_y"/><motor joint="head_z"/></actuator>
+  <sensor><touch name="tl" site="a"/><touch name="tr" site="b"/></sensor>
+</mujoco>
+""", "mini.toml": b"""[root]
+body = "hips"
+scale_xy = 0.5
+[map]
+skull = { from = "pelvis", to = "head" }
+left = { from = "pelvis", to = "foot_l" }
+right = { from = "pelvis", to = "foot_r" }
+[pose]
+head_y = 0.3
+[torque]
+base = { leg = 20.0, default = 4.0 }
+scale = { head = 0.5 }
+[passive]
+stiffness = { leg = 40.0, default = 4.0 }
+damping = 0.1
+armature = { leg = 0.01, head = 0.02 }
+[observation]
+links = ["skull"]
+[reward]
+q = [1, 1]
+qd = [1, 1]
+x = [1, 1]
+xd = [1, 1]
+contact = [1, 1]
+orientation = [1, 1]
+action_diff = [1, 1]
+action_min = [1, 1]
+fail = -1
+links = { hips = 3.0, skull = 1.0 }
+joints = { leg = 0.3, head_z = 2.0 }
+[feet]
+bodies = ["left", "right"]
+contact_sensors = ["tl", "tr"]
+[sensors]
+sites = ["eyes", "a", "b"]
+[fall]
+bodies = ["hips", "skull"]
+"""}  # fmt: skip
+
+
+# ---------------------------------------------------------------- policies and runs
+
+VALUES = [
+    None, True, -1, 0, 0.5, 1e308, 10**30, 10**59, "", "0", "nan", "a" * 500, [], [[]], {}, {"a": 1}, [1, "b"], [0],
+    [-3], [10**6, 10**6], [1e9], ["8"], "builtin", float("nan"), float("inf"),
+]  # fmt: skip
+
+
+@st.composite
+def json_damage(draw, tree):
+    """One to three values of a tree replaced, gone or nested without end; as text, which is sometimes damaged again."""
+    tree = json.loads(json.dumps(tree))
+    for _ in range(draw(st.integers(0, 3))):
+        at = tree
+        while True:
+            keys = list(at) if isinstance(at, dict) else list(range(len(at)))
+            key = keys[draw(st.integers(0, len(keys) - 1))]
+            if not (isinstance(at[key], dict | list) and at[key] and draw(st.booleans())):
+                break
+            at = at[key]
+        what = draw(st.sampled_from(["value", "value", "value", "gone", "deep"]))
+        if what == "gone" and len(at) > 1:
+            del at[key]
+        else:
+            at[key] = copy.deepcopy(draw(st.sampled_from(VALUES))) if what == "value" else "DEEP"
+    raw = json.dumps(tree).replace('"DEEP"', "[" * 3000 + "]" * 3000).encode()
+    return draw(damaged(raw)) if draw(st.integers(0, 3)) == 0 else raw
+
+
+def members(raw):
+    """An .npz -> {name: bytes of its .npy}."""
+    with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def zipped(entries, compressed=()):
+    """(name, bytes) -> an .npz."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that a name is there twice
+        for k, (name, data) in enumerate(entries):
+            archive.writestr(name, data, zipfile.ZIP_DEFLATED if k in compressed else zipfile.ZIP_STORED)
+    return out.getvalue()
+
+
+def npy(array, pickled=False):
+    out = io.BytesIO()
+    np.lib.format.write_array(out, np.asarray(array), allow_pickle=pickled)
+    return out.getvalue()
+
+
+def claiming(descr, shape, order=False, data=b""):
+    """A .npy whose header says anything."""
+    text = f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}".encode()
+    text += b" " * (-(len(text) + 11) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + data
+
+
+CLAIMS = [
+    ("'<f4'", "(1000000000000,)"), ("'<f8'", "(1000000,)"), ("'<f8'", "(-1,)"), ("'<f8'", "(0,)"), ("'<f8'", "(1.5,)"),
+    ("'<f8'", f"({2**63},)"), ("'<f8'", f"({2**32}, {2**32}, {2**32})"), ("'<f8'", "5"), ("'<f8'", "(True,)"),
+    ("'|O'", "(1,)"), ("'<U1000000000'", "(1,)"), ("'|V8'", "(1,)"), ("'V0'", "(1000000000000,)"), ("'<U0'", "(7,)"),
+    ("'<M8[s]'", "()"), ("[('a', '<f8')]", "(1,)"), ("'<f8'", "(" * 90 + ")" * 90), ("'what'", "()"), ("None", "()"),
+    ("'<c16'", "()"), ("'>f8'", "()"), ("__import__('os')", "()"), ("'<f8'", "(" + "1," * 40 + ")"),
+    ("'<f8'", "(1L,)"), ("'<f8", "()"), ("'<f8'", "(1,"),
+]  # fmt: skip
+ELEMENTS = [np.nan, np.inf, -np.inf, 1e308, -1.0, 0.0, 1e30, 1e-308]
+
+
+class Code:
+    """Unpickled, it writes a file."""
+
+    def __reduce__(self):
+        return exec, ("open('unpickled', 'w')",)
+
+
+@st.composite
+def npz_damage(draw, raw):
+    """An array's header, numbers, kind or name; a member gone, doubled, compressed or pickled; meta's JSON; bytes."""
+    if draw(st.integers(0, 3)) == 0:
+        for _ in range(draw(st.integers(1, 3))):
+            raw = draw(st.sampled_from([cut, splice, encoding]))(draw, raw)
+        return raw
+    entries, compressed = list(members(raw).items()), ()
+    k = draw(st.integers(0, len(entries) - 1))
+    name, data = entries[k]
+    array = np.lib.format.read_array(io.BytesIO(data))
+    what = draw(st.sampled_from(["meta"] * 4 + ["element"] * 3 + ["claim"] * 2
+                                + "dtype shape gone double rename deflate bomb pickle bytes".split()))  # fmt: skip
+    if what == "meta":
+        k, (name, data) = next((k, e) for k, e in enumerate(entries) if e[0] == "__meta__.npy")
+        meta = json.loads(np.lib.format.read_array(io.BytesIO(data)).tobytes())
+        entries[k] = name, npy(np.frombuffer(draw(json_damage(meta)), np.uint8))
+    elif what == "element" and array.size:
+        array = array.astype(array.dtype if array.dtype.kind == "f" else float)
+        with np.errstate(over="ignore"):
+            array.reshape(-1)[draw(st.integers(0, array.size - 1))] = draw(st.sampled_from(ELEMENTS))
+        entries[k] = name, npy(array)
+    elif what == "claim":
+        entries[k] = name, claiming(*draw(st.sampled_from(CLAIMS)), draw(st.booleans()), data[128:])
+    elif what == "dtype":
+        kind = draw(st.sampled_from(["f8", "f2", "c16", "i1", "u8", "?", "U8", "S4", ">f4", "M8[s]", "V4"]))
+        with np.errstate(all="ignore"):
+            entries[k] = name, npy(np.zeros(array.shape, kind))
+    elif what == "shape":
+        shapes = [array[..., None], array.reshape(-1)[:-1], np.zeros((0, 7)), np.zeros(()), np.repeat(array, 2)]
+        entries[k] = name, npy(draw(st.sampled_from(shapes)))
+    elif what == "gone":
+        del entries[k]
+    elif what == "double":
+        entries.append(entries[k])
+    elif what == "rename":
+        entries[k] = draw(st.sampled_from(["a", "../x.npy", "policy.pi.npy", "a" * 5000, "\u2028.npy"])), data
+    elif what == "deflate":
+        compressed = (k,)
+    elif what == "bomb":
+        entries.append(("bomb.npy", npy(np.zeros(2**23, np.uint8))))
+        compressed = (len(entries) - 1,)
+    elif what == "pickle":
+        entries[k] = name, npy(np.array([Code()], object), True)
+    else:
+        entries[k] = name, draw(damaged(data))
+    return zipped(entries, compressed)
+
+
+def npz_bytes(arrays, meta):
+    out = zipped([(f"{name}.npy", npy(value)) for name, value in arrays.items()])
+    text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+    return zipped([*members(out).items(), ("__meta__.npy", npy(text))])
+
+
+def check_policy(policy):
+    finite([policy.theta_pi, policy.critic.theta, policy.norm.mean, policy.norm.inv_std, float(policy.value_scale)])
+    finite(policy.mean_action(np.zeros((2, policy.obs_size))))
+
+
+@pytest.fixture(scope="module")
+def policy_file():
+    policy = ppo.Policy(5, 7, 2, (4,), (3, 2), 0.1, 1.0, np.random.default_rng(0))
+    policy.norm.update(np.random.default_rng(0).normal(size=(4, 7)))
+    return npz_bytes(policy.arrays(), {"policy": policy.shape(), "steps": 5, "options": {"motion": "builtin"}})
+
+
+@pytest.fixture(scope="module")
+def trainer(jesse):
+    """A small run: restored again and again."""
+    opt = ppo.Options(envs=2, horizon=2, minibatch=4, hidden=(4,), value_hidden=(4,), threads=1)
+    trainer = ppo.Trainer(opt, Env(jesse, retarget.reference(jesse, [walk(1.0)]), 2, 0, 1))
+    trainer.start()
+    trainer.collect()
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def run_files(trainer, tmp_path_factory):
+    path = tmp_path_factory.mktemp("run") / "whole.npz"
+    trainer.save(path, {"rows": 2, "options": asdict(trainer.opt)})
+    config = {"config": asdict(trainer.opt) | {"data": {"minutes": 1.5}}, "versions": {}, "git": {}, "earlier": []}
+    metrics = b"update,steps,reward,length\n1,4,0.5,nan\n2,8,,12.25\n"
+    return {"config.json": json.dumps(config).encode(), "metrics.csv": metrics, "checkpoint.npz": path.read_bytes()}
+
+
+def resuming(trainer):
+    """What `ppo.py --resume` reads before it goes on."""
+
+    def read(folder):
+        runs.check_run(folder, resume=True)
+        opt = ppo.resumed_options(ppo.Options(out=str(folder), resume=True), ["--resume"])
+        for f in fields(opt):
+            kinds = {type(f.default), type(None)} | ({int} if type(f.default) is float else set())
+            assert f.default is None or type(getattr(opt, f.name)) in kinds, f.name
+        loaded = runs.latest_checkpoint(folder, ppo.FINITE)
+        columns = runs.read_metrics(folder / runs.METRICS)
+        assert len({len(c) for c in columns.values()}) <= 1
+        if loaded:
+            trainer.restore(*loaded, folder / runs.CHECKPOINT)
+            check_policy(trainer.policy)
+            finite([trainer.adam_pi.m, trainer.adam_pi.v, trainer.adam_v.v, trainer.adam_pi.lr, trainer.env.full])
+            assert trainer.steps >= 0 and trainer.updates >= 0 and trainer.adam_pi.t >= 0
+
+    return read
+
+
+# ---------------------------------------------------------------- headsets
+
+
+@pytest.fixture(scope="module")
+def csv_files():
+    """A little more than the second that calibrates, of a standing user at 20 Hz: axes -> bytes."""
+    t, pos, quat = zip(*standing(1.3, rate=20.0))
+    return {axes: re.sub(r"(\.\d{4})\d+", r"\1", "".join(to_csv(t, pos, quat, axes))).encode() for axes in AXES}
+
+
+def playing(char, live):
+    """What `play.py --stream` does, with a policy that does nothing."""
+    player = Player(char, lambda obs: np.zeros((1, len(char.limits))))
+
+    def read(folder):
+        name = "-" if live else folder / "take.csv"
+        source = calibration.Stream(char, (folder / "axes").read_text())
+        reader = Reader("standard input" if live else str(name), strict=not live)
+        with pytest.MonkeyPatch.context() as patch:
+            if live:
+                patch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO((folder / "take.csv").read_bytes())))
+            ticks = (tick for sample in reader.read(lines_of(name)) for tick in source.push(sample))
+            for k, tick in enumerate(ticks):
+                finite(list(tick))
+                np.testing.assert_allclose(np.linalg.norm(tick.quat, axis=-1), 1.0, atol=1e-6)
+                if k < 20:
+                    player.step(tick.pos, tick.quat)
+                    finite([player.qpos, player.qvel, player.obs])
+        assert len(source.seen) <= 1000
+        source.report()
+
+    return read
+
+
+# ---------------------------------------------------------------- the tests
+
+
+@pytest.fixture(scope="module")
+def readers(jesse, bvh_files, cmu_files, policy_file, trainer, run_files, csv_files):
+    """name -> valid folders, as {file: bytes}; the function that reads one; the strategies of damage to its files"""
+    text = lambda *names: {name: damaged for name in names}  # noqa: E731
+    deep_bvh = lambda raw: damaged(raw, inserting(chain(50)))  # noqa: E731
+    deep_xml = lambda raw: damaged(raw, inserting(b'<body name="b">' * 1000))  # noqa: E731
+    take = {axes: {"take.csv": raw, "axes": axes.encode()} for axes, raw in csv_files.items()}
+    load_policy = lambda folder: check_policy(ppo.load_policy(folder / "p.npz")[0])  # noqa: E731
+    resumed = {"config.json": lambda raw: json_damage(json.loads(raw)), "metrics.csv": damaged}
+    return {
+        "bvh": ([{"take.bvh": raw} for raw in bvh_files.values()], reading_motion(jesse, "take.bvh"),
+                {"take.bvh": deep_bvh}),
+        "amc": ([cmu_files], reading_motion(jesse, "16_01.amc"), text("16.asf", "16_01.amc")),
+        "map": ([{"take.bvh": bvh_files["xsens"], "map.toml": JOINT_MAP}],
+                reading_motion(jesse, "take.bvh", "map.toml"), text("map.toml")),
+        "toml": ([MINI], read_character, text("mini.toml")),
+        "xml": ([MINI], read_character, {"mini.xml": deep_xml}),
+        "policy": ([{"p.npz": policy_file}], load_policy, {"p.npz": npz_damage}),
+        "run": ([run_files], resuming(trainer), resumed | {"checkpoint.npz": npz_damage}),
+        "stream": (list(take.values()), playing(jesse, live=False), text("take.csv")),
+        "stdin": ([take["unity"]], playing(jesse, live=True), text("take.csv")),
+    }  # fmt: skip
+
+
+def test_bvh(fuzz, readers):
+    fuzz(*readers["bvh"])
+
+
+def test_asf_and_amc(fuzz, readers):
+    fuzz(*readers["amc"])
+
+
+def test_joint_maps(fuzz, readers):
+    fuzz(*readers["map"])
+
+
+def test_character_tables(fuzz, readers):
+    fuzz(*readers["toml"])
+
+
+def test_character_models(fuzz, readers):
+    fuzz(*readers["xml"])
+
+
+def test_policies(fuzz, readers, tmp_path):
+    fuzz(*readers["policy"])
+    assert not (tmp_path / "unpickled").exists()
+
+
+def test_run_folders(fuzz, readers):
+    fuzz(*readers["run"])
+
+
+def test_headset_files(fuzz, readers):
+    fuzz(*readers["stream"])
+
+
+def test_standard_input(fuzz, readers):
+    fuzz(*readers["stdin"], source="standard input")
+
+
+# ---------------------------------------------------------------- what is meant to hurt
+
+
+def deep_head(raw, joints=10_000):
+    """The skeleton of a known rig with so many joints hanging from its head, one from the other."""
+    opened = b"".join(b"JOINT x%d { OFFSET 0 1 0 CHANNELS 1 Xrotation " % k for k in range(joints))
+    at = raw.index(b"End Site", raw.index(b"JOINT Head"))
+    hierarchy, motion = (raw[:at] + opened + b"}" * joints + raw[at:]).split(b"MOTION")
+    rows = motion.strip().split(b"\n")
+    return b"%sMOTION\nFrames: 1\n%s\n%s" % (hierarchy, rows[1], rows[2] + b" 0" * joints)
+
+
+def fixed_joints(frames=20_000):
+    """One joint that turns, a thousand that do not, and many frames: small to read, large to pose."""
+    text = chain(1000, "CHANNELS 0").replace(b"CHANNELS 0", b"CHANNELS 1 Xrotation", 1)
+    return re.sub(rb"Frames: 1\n(.*)\n\n", rb"Frames: %d\n\1\n" % frames + b"0\n" * frames, text)
+
+
+def nanoseconds(raw, rows=1100):
+    """A stream whose clock hardly runs: the second that calibrates never ends."""
+    lines = raw.split(b"\n")
+    still = [re.sub(rb"^[^,]*", b"%.9f" % (2e-9 * k), lines[1 + k % 20]) for k in range(rows)]
+    return b"\n".join([lines[0], *still])
+
+
+def dotted(parts):
+    return b".".join([b"a"] * parts) + b" = 1\n"
+
+
+def overlapping(raw, times=1000):
+    """An .npz whose directory names one member so many times."""
+    with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+        start = archive.start_dir
+    directory, end = raw[start : raw.index(b"PK\x05\x06", start)], raw[raw.index(b"PK\x05\x06", start) :]
+    first = directory[: directory.index(b"PK\x01\x02", 4)]
+    end = end[:8] + struct.pack("<HHLL", times, times, len(first) * times, start) + end[20:]
+    return raw[:start] + first * times + end
+
+
+def drop_outs(raw, rows=6):
+    """A stream whose clock runs 4.9 s on with every row."""
+    lines = raw.split(b"\n")
+    moving = [re.sub(rb"^[^,]*", b"%.1f" % (2 + 4.9 * k), lines[1 + k % 20]) for k in range(rows)]
+    return b"\n".join([*lines[:-1], *moving])
+
+
+def bones(raw, count=10_000):
+    """A chain of so many bones more, none of which moves."""
+    rows = b"".join(b"begin\nname b%d\ndirection 0 1 0\nlength 1\naxis 0 0 0 XYZ\nend\n" % k for k in range(count))
+    tree = b"".join(b"b%d b%d\n" % (k, k + 1) for k in range(count - 1))
+    return raw.replace(b":hierarchy\nbegin\n", rows + b":hierarchy\nbegin\nroot b0\n" + tree)
+
+
+def swap(old, new):
+    return lambda raw: raw.replace(old, new)
+
+
+def in_world(text):
+    return swap(b"<worldbody>", b"<worldbody>" + text)
+
+
+BIG = b"1" * 200_000
+HURTING = {  # name: (reader, file, function of the valid file's bytes, whether it loads)
+    "a million frames": ("bvh", "take.bvh", swap(b"Frames: 4", b"Frames: 1000000"), False),
+    "10^12 frames": ("bvh", "take.bvh", swap(b"Frames: 4", b"Frames: 1000000000000"), False),
+    "10,000 joints deep": ("bvh", "take.bvh", lambda raw: chain(10_000), False),
+    "10,000 joints deep in a known rig": ("bvh", "take.bvh", deep_head, True),
+    "joints that cannot move": ("bvh", "take.bvh", lambda raw: fixed_joints(), False),
+    "a frame of eleven days": ("bvh", "take.bvh", swap(b"Time: 0.0333", b"Time: 1e6"), False),
+    "a name of a megabyte": ("bvh", "take.bvh", swap(b"Head", b"H" * 2**20), False),
+    "a line of five megabytes": ("bvh", "take.bvh", swap(b"\nMOTION", b" " * 5 * 2**20 + b"\nMOTION"), True),
+    "bones that cannot move": ("amc", "16.asf", bones, False),
+    "a frame of number 10^18": ("amc", "16_01.amc", swap(b"\n11\n", b"\n%d\n" % 10**18), False),
+    "a map of brackets": ("map", "map.toml", lambda raw: b"unit = " + b"[" * 10_000, False),
+    "a map of dots": ("map", "map.toml", lambda raw: dotted(30_000), False),
+    "a map of lines of dots": ("map", "map.toml", lambda raw: dotted(480) * 60, False),
+    "a map of a table of dots": ("map", "map.toml", lambda raw: b"[a%s]\n" % (b".a" * 490) + b"a.b=1\n" * 9000, False),
+    "a map of ten megabytes": ("map", "map.toml", lambda raw: b"#\n" * 5_000_000, False),
+    "a site 10^9 times": ("xml", "mini.xml", in_world(b'<replicate count="1e9"><site/></replicate>'), False),
+    "a site 100^3 times": ("xml", "mini.xml", in_world(b'<replicate count="100">' * 3 + b"</replicate>" * 3), False),
+    "a texture of 10^10 pixels": (
+        "xml", "mini.xml",
+        swap(b"<default>", b'<asset><texture builtin="flat" width="100000" height="100000"/></asset><default>'), False,
+    ),
+    "a model that includes itself": ("xml", "mini.xml", in_world(b'<include file="mini.xml"/>'), False),
+    "entities of entities": (
+        "xml", "mini.xml", lambda raw: b'<!DOCTYPE m [<!ENTITY a "a"><!ENTITY b "&a;&a;">]>' + raw, False,
+    ),
+    "a policy of 10^12 numbers": ("policy", "p.npz", lambda raw: zipped([("a.npy", claiming(*CLAIMS[0]))]), False),
+    "a policy deflated": ("policy", "p.npz", lambda raw: zipped([("a.npy", npy(np.zeros(2**26, "u1")))], (0,)), False),
+    "a member a thousand times": ("policy", "p.npz", overlapping, False),
+    "20,000 members": ("policy", "p.npz", lambda raw: zipped([(f"{k}.npy", b"") for k in range(20_000)]), False),
+    "JSON 100,000 deep": ("run", "config.json", lambda raw: b'{"config": ' + b"[" * 100_000, False),
+    "JSON whole and deep": ("run", "config.json", lambda raw: b"[" * 900 + b"]" * 900, False),
+    "an integer of 200,000 digits": ("run", "config.json", lambda raw: b'{"config": {"seed": %s}}' % BIG, False),
+    "a cell of 200,000 digits": ("run", "metrics.csv", lambda raw: b"a,b\n1,%s\n" % BIG, False),
+    "200,000 columns": ("run", "metrics.csv", lambda raw: b"a," * 200_000 + b"b\n", False),
+    "a stream of drop-outs": ("stream", "take.csv", drop_outs, True),
+    "a stream of nanoseconds": ("stream", "take.csv", nanoseconds, False),
+    "a stream in one line": ("stream", "take.csv", lambda raw: raw.replace(b"\n", b",") * 100, False),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", HURTING)
+def test_what_is_meant_to_hurt(readers, tmp_path, case):
+    """Claims, bombs, depth and length: within the deadline, and in little memory."""
+    reader, name, raw, loads = HURTING[case]
+    files, read, _ = readers[reader]
+    raw = raw(files[0][name]) if callable(raw) else raw
+    assert raw != files[0][name]
+    Input(files[0] | {name: raw}).write(tmp_path)
+    assert attempt(read, tmp_path, measured=len(raw) < 10_000 and reader != "stream") == loads
+
+
+FILES = ("bvh take.bvh", "amc 16.asf", "amc 16_01.amc", "map map.toml", "toml mini.toml", "xml mini.xml",
+         "policy p.npz", "run config.json", "run metrics.csv", "run checkpoint.npz", "stream take.csv")  # fmt: skip
+
+
+@pytest.mark.parametrize("what", ["folder", "empty", "gone", "zeros"])
+@pytest.mark.parametrize("file", FILES)
+def test_no_such_file(readers, tmp_path, file, what):
+    """A folder in a file's place, an empty file, none, and one of zeros."""
+    reader, name = file.split()
+    files, read, _ = readers[reader]
+    Input(files[0]).write(tmp_path)
+    (tmp_path / name).unlink()
+    if what == "folder":
+        (tmp_path / name).mkdir()
+    elif what != "gone":
+        (tmp_path / name).write_bytes(bytes(1000) if what == "zeros" else b"")
+    nothing = {("checkpoint.npz", "gone"), ("metrics.csv", "empty"), ("metrics.csv", "zeros"), ("map.toml", "empty")}
+    assert attempt(read, tmp_path, True, name) == ((name, what) in nothing)

@@ -1,0 +1,365 @@
+"""REPRODUCE.md against the code and the tests: every name it gives exists, and nothing it owes is missing.
+
+Part 1's table is `id | what | code | test`.  `code` holds `module.name` or `file.toml [table] key`, `test` holds
+`tests/test_x.py::test_a`; a row without a test says `not yet`, `not run yet` or `missing`.  Part 2's tables are
+`id | not said | choice | where | why`.
+"""
+
+import ast
+import importlib
+import re
+import tomllib
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+WINGS = ("characters", "mocap", "headset", "drop", "skeletal", "extras", "plumbing")
+FILES = sorted([*ROOT.glob("*.py"), *(f for wing in WINGS for f in (ROOT / wing).rglob("*.py"))])
+MODULES = [".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for f in FILES]
+PATHS = dict(zip(MODULES, FILES, strict=True))
+OPEN = ("not yet", "not run yet", "missing")
+
+REQUIRED = (
+    *(f"Eq. {k}" for k in range(1, 12)),
+    *("App. B experience", "App. B value recursion", "App. B bootstrap", "App. B advantage", "App. B loss"),
+    *("App. B ratio", "App. B value loss"),
+    *("Table 1", "Table 2", "Table 3", "Table 4"),
+    *("§3.3 frame", "§3.3 heading", "§3.3 asymmetric critic", "§3.4 sensors", "§3.4 kinematic retargeting"),
+    *("§3.4 scaled root", "§3.5 orientation", "§3.5 contact", "§3.5 not imitated"),
+    *("contact 0.20 m", "contact 0.4 m/s", "contact 1 N"),
+    *("§3.6 upper body", "§3.6 0.30 m", "§3.6 500 steps", "§3.6 clip end", "§3.6 fail −5"),
+    *("§3.6 reference-state initialisation", "§3.7 actions", "§3.7 passive joints"),
+    *(f"§4, §5 point {k}" for k in range(1, 10)),
+    *(f"metric {m}" for m in (
+        "completed", "survival", "root_cm", "head_cm", "hands_cm", "joint_pos_cm", "head_deg", "joint_rot_deg",
+        "sip_deg", "foot_slide_cm_s", "penetration_mm", "contact_agreement", "jitter_m_s3", "steps_per_m",
+        "head_wobble_deg_s", "torque_rms", "saturation",
+    )),
+    *(f"DROP Eq. {k}" for k in range(1, 17)),
+    *("DROP Algorithm 1", "DROP §7 rotations"), *(f"DROP §8.{k}" for k in (1, 2, 3, 4, 5, 7)),
+    *(f"SAN-{k}" for k in range(1, 9)),
+    *(f"SAN §{s}" for s in ("4.1", "4.2 static branch", "4.3 unpooling", "3 primal skeleton", "4.4", "5.2 networks")),
+    *("SAN §5 training", "SAN §5.2 clean-up", "SAN metric"),
+)  # fmt: skip
+# Missing, or experiments: these need no code and no test.
+MAY_BE_OPEN = ("Table 1", "Table 3", "§4, §5")
+
+GAPS = (  # every GAP and ASSUMED of the specification, in its order
+    "advantage", "lambda", "Table 3", "Table 1", "previous user frame", "root scale axes", "link weights",
+    "weight normalisation", "contact distance", "orientation kernel", "orientation rest offset",
+    "termination distance", "fail reward", "base torque", "clipped actions",
+)  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------ reading
+
+
+@cache
+def part(number: int) -> str:
+    """Text of one of REPRODUCE.md's numbered parts."""
+    text = (ROOT / "REPRODUCE.md").read_text(encoding="utf-8")
+    found = re.search(rf"^## {number}\. .*?(?=^## \d+\. |\Z)", text, re.M | re.S)
+    assert found, f"REPRODUCE.md has no part '## {number}. …'"
+    return found[0]
+
+
+@cache
+def rows(number: int) -> tuple:
+    """Cells of all table rows of a part, headers and rules left out."""
+    out = []
+    for line in part(number).splitlines():
+        cells = [c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]]
+        if cells and not set(cells[0]) <= set("-: ") and cells[0] != "id":
+            out.append(tuple(cells))
+    return tuple(out)
+
+
+def quoted(cell: str) -> list:
+    """The names between backticks."""
+    return re.findall(r"`([^`]+)`", cell)
+
+
+@cache
+def parsed(path: Path) -> ast.Module:
+    """Syntax tree of a Python file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
+def functions_in(name: str) -> frozenset:
+    """Names of the test functions of tests/NAME; empty where the file is missing."""
+    path = ROOT / "tests" / name
+    if not path.is_file():
+        return frozenset()
+    return frozenset(
+        n.name for n in ast.walk(parsed(path)) if isinstance(n, ast.FunctionDef) and n.name.startswith("test_")
+    )
+
+
+def missing_test(name: str) -> str | None:
+    """Complaint about a name such as tests/test_x.py::test_a, or None."""
+    file, _, function = name.removeprefix("tests/").partition("::")
+    if not (ROOT / "tests" / file).is_file():
+        return f"{name}: there is no tests/{file}"
+    if function and function not in functions_in(file):
+        return f"{name}: tests/{file} has no such test"
+    return None
+
+
+def missing_code(name: str) -> str | None:
+    """Complaint about `module.name.name` or `file.toml [table] key`, or None."""
+    if found := re.fullmatch(r"(\S+\.toml)(?: \[([\w.]+)\](?: (\w+))?)?", name):
+        path, table, key = found.groups()
+        if not (ROOT / path).is_file():
+            return f"{name}: no such file"
+        value = tomllib.loads((ROOT / path).read_text(encoding="utf-8"))
+        for k in [*(table.split(".") if table else []), *([key] if key else [])]:
+            if not isinstance(value, dict) or k not in value:
+                return f"{name}: no {k!r}"
+            value = value[k]
+        return None
+    if name.endswith((".xml", ".py", ".lock", ".toml")):
+        return None if (ROOT / name).is_file() else f"{name}: no such file"
+    parts = name.split(".")
+    k = next((k for k in range(len(parts), 0, -1) if ".".join(parts[:k]) in PATHS), 0)
+    if not k:
+        return f"{name}: no module; there are {', '.join(MODULES)}"
+    module, attributes = ".".join(parts[:k]), parts[k:]
+    value = importlib.import_module(module)
+    for a in attributes:
+        fields = getattr(value, "__dataclass_fields__", {})
+        if hasattr(value, a):
+            value = getattr(value, a)
+        elif a in fields:
+            value = None
+        else:
+            return f"{name}: {value!r} has no {a!r}"
+    return None
+
+
+# ------------------------------------------------------------------------------------ part 1
+
+
+def test_every_row_is_complete():
+    """Four cells; named code and a named test, or a word that says why not."""
+    bad = []
+    for row in rows(1):
+        if len(row) != 4:
+            bad.append(f"{row[0]}: {len(row)} cells, expected 4")
+        elif any(not quoted(cell) and cell not in OPEN for cell in row[2:]):
+            bad.append(f"{row[0]}: code {row[2]!r}, test {row[3]!r}; expected names, or one of {', '.join(OPEN)}")
+    assert rows(1) and not bad, "\n".join(bad)
+
+
+@pytest.mark.parametrize("wanted", REQUIRED)
+def test_nothing_of_the_specification_is_missing(wanted):
+    """A row for every equation, table, threshold and metric; with code and test unless it is missing or not run."""
+    found = [r for r in rows(1) if r[0] == wanted]
+    assert found, f"REPRODUCE.md, part 1 has no row {wanted!r}"
+    if not wanted.startswith(MAY_BE_OPEN):
+        assert any(quoted(r[2]) and quoted(r[3]) for r in found), f"{wanted} has no code or no test: {found}"
+
+
+def test_named_code_exists():
+    """Parts 1 and 2."""
+    names = {n for row in rows(1) for n in quoted(row[2])} | {n for row in rows(2) for n in quoted(row[3])}
+    bad = sorted(filter(None, map(missing_code, names)))
+    assert names and not bad, "\n".join(bad)
+
+
+def test_named_tests_exist():
+    """Part 1."""
+    names = {n for row in rows(1) for n in quoted(row[3])}
+    bad = sorted(filter(None, map(missing_test, names)))
+    assert names and not bad, "\n".join(bad)
+
+
+# ------------------------------------------------------------------------------------ part 2
+
+
+def test_every_gap_is_listed_in_order():
+    """The specification's gaps, in its order, each with a choice, a place and a reason."""
+    ids = [r[0] for r in rows(2)]
+    missing = [g for g in GAPS if g not in ids]
+    assert not missing, f"REPRODUCE.md, part 2 lacks {missing}"
+    assert [i for i in ids if i in GAPS] == list(GAPS), "the gaps are not in the specification's order"
+    bad = [r[0] for r in rows(2) if len(r) != 5 or not all(r[1:])]
+    assert not bad, f"rows without five filled cells: {bad}"
+
+
+def assumptions_of_python(path: Path):
+    """(line, names one of which must be listed) of every ASSUMED: of the top-level symbol it stands in or before."""
+    body = parsed(path).body
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        if "ASSUMED" not in line:
+            continue
+        node = next((n for n in body if number <= n.end_lineno), None)
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            names = [node.name]
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)]
+        else:
+            names = []
+        module = MODULES[FILES.index(path)]
+        yield number, [f"{module}.{n}" for n in names] or [str(path.relative_to(ROOT))]
+
+
+def assumptions_of_toml(path: Path):
+    """(line, [table that must be listed]) of every ASSUMED."""
+    relative, table = path.relative_to(ROOT), ""
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        if found := re.match(r"\[([\w.]+)\]", line):
+            table = f" [{found[1]}]"
+        if "ASSUMED" in line:
+            yield number, [f"{relative}{table}"]
+
+
+def test_every_assumed_is_listed():
+    """A word ASSUMED in the code obliges part 2 to name the function, constant or table it stands in."""
+    listed = {n for row in rows(2) for n in quoted(row[3])}
+    covers = lambda want: any(n == want or n.startswith((want + ".", want + " ")) for n in listed)  # noqa: E731
+    bad = []
+    sources = [(p, assumptions_of_python(p)) for p in FILES]
+    sources += [(p, assumptions_of_toml(p)) for p in sorted((ROOT / "characters").glob("*.toml"))]
+    for path, found in sources:
+        where = path.relative_to(ROOT)
+        bad += [f"{where}:{line}: {' or '.join(want)}" for line, want in found if not any(map(covers, want))]
+    assert not bad, "REPRODUCE.md, part 2 does not name\n" + "\n".join(bad)
+
+
+# ------------------------------------------------------------------------------------ docstrings
+
+
+def docstrings(module: str):
+    """(qualified name, docstring) of a module and all that is in it."""
+    tree = parsed(PATHS[module])
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.FunctionDef, ast.ClassDef)) and ast.get_docstring(node):
+            yield f"{module}.{getattr(node, 'name', '')}".rstrip("."), ast.get_docstring(node)
+
+
+def promised_tests(text: str) -> list:
+    """Names on the `Test` lines of a docstring, written in full.
+
+    A line is `Test  tests/test_x.py::test_a, test_b`; the folder and the file may be left out after the first."""
+    out = []
+    for found in re.finditer(r"\bTest:?\s+((?:tests/)?(?:\w+/)?test_\w+\.py(?:[^\n]*,\s*\n)*[^\n]*)", text):
+        file = None
+        for token in found[1].split(","):
+            token = token.strip().rstrip(".")
+            match = re.fullmatch(r"(?:(?:tests/)?((?:\w+/)?test_\w+\.py))?(?:(?:::)?(test_\w+))?", token)
+            if not match or not token:
+                out.append(f"{token!r} cannot be read")
+                continue
+            file = match[1] or file
+            out.append(f"tests/{file}" + (f"::{match[2]}" if match[2] else ""))
+    return out
+
+
+def test_promised_tests_reader():
+    """The reader itself, on the spellings in use."""
+    assert promised_tests("x.  Test: test_a.py::test_b.") == ["tests/test_a.py::test_b"]
+    text = "Test   tests/test_a.py::test_b, ::test_c,\n       test_d, test_e.py::test_f\nmore"
+    wanted = ["a.py::test_b", "a.py::test_c", "a.py::test_d", "e.py::test_f"]
+    assert promised_tests(text) == [f"tests/test_{w}" for w in wanted]
+    assert promised_tests("Test   tests/test_a.py") == ["tests/test_a.py"]
+    assert "cannot be read" in promised_tests("Test   tests/test_a.py::test_b and more")[0]
+    assert missing_test("tests/test_docs.py::test_promised_tests_reader") is None
+    assert missing_test("tests/test_docs.py::test_nothing") and missing_test("tests/test_nowhere.py")
+    assert missing_code("ppo.gae") is None and missing_code("env.Env.step") is None
+    assert missing_code("characters/jesse.toml [reward] q") is None
+    assert missing_code("ppo.nothing") and missing_code("nowhere.gae")
+    assert missing_code("characters/jesse.toml [nothing]") and missing_code("nowhere.toml [reward]")
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_docstrings_name_real_tests(module):
+    """Every `Test` line of a product module."""
+    bad = [
+        f"{where}: {problem}"
+        for where, text in docstrings(module)
+        for name in promised_tests(text)
+        if (problem := name if "cannot be read" in name else missing_test(name))
+    ]
+    assert not bad, "\n".join(bad)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_public_names_have_docstrings(module):
+    """Functions and classes of a product module, and the module itself."""
+    tree = parsed(PATHS[module])
+    bad = [] if ast.get_docstring(tree) else [module]
+    for node in tree.body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+            if not ast.get_docstring(node):
+                bad.append(f"{module}.{node.name} (line {node.lineno})")
+    assert not bad, "without a docstring: " + ", ".join(bad)
+
+
+# ------------------------------------------------------------------------------------ the house
+
+ORDER = (  # a module imports only what stands on a line above its own, or in its own wing
+    ("plumbing", "nn", "human"),
+    ("mocap", "character"),
+    ("retarget",),
+    ("env",),
+    ("policy",),
+    ("ppo", "headset"),
+    ("play",),
+    ("metrics",),
+    ("extras", "characters", "drop", "skeletal"),
+)
+BESIDE = {"drop": ("human", "mocap", "nn", "plumbing"), "skeletal": ("human", "mocap", "nn", "plumbing", "retarget")}
+RANK = {name: k for k, names in enumerate(ORDER) for name in names}
+
+
+def imports_of(path: Path):
+    """(line, module of ours) of every import in a file, also in a function."""
+    for node in ast.walk(parsed(path)):
+        names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom):
+            names = [node.module]
+            names += [f"{node.module}.{a.name}" for a in node.names if f"{node.module}.{a.name}" in PATHS]
+        for name in names:
+            if name.split(".")[0] in {m.split(".")[0] for m in MODULES}:
+                yield node.lineno, name
+
+
+def test_imports_run_one_way(capsys):
+    """No import from below up, and the graph is printed; the wings of other papers stand on the ground alone."""
+    bad, graph = [], {}
+    for module, path in PATHS.items():
+        own = module.split(".")[0]
+        for line, name in imports_of(path):
+            other = name.split(".")[0]
+            if other == own:
+                continue
+            graph.setdefault(own, set()).add(other)
+            allowed = BESIDE.get(own, [n for n, rank in RANK.items() if rank < RANK[own]])
+            if other not in allowed:
+                bad.append(f"{path.relative_to(ROOT)}:{line}: {own} imports {name}")
+    with capsys.disabled():
+        print("\n" + "\n".join(f"  {k} < {', '.join(sorted(graph.get(k, ())))}" for k in RANK))
+    assert not bad, "\n".join(bad)
+
+
+def test_no_circles():
+    """Between files, whatever the wing."""
+    edges = {m: {n for _, n in imports_of(p) if n in PATHS and n != m} for m, p in PATHS.items()}
+    seen, done = [], set()
+
+    def visit(m):
+        assert m not in seen, "circle: " + " -> ".join([*seen[seen.index(m) :], m])
+        if m in done:
+            return
+        seen.append(m)
+        for n in sorted(edges[m]):
+            visit(n)
+        seen.pop()
+        done.add(m)
+
+    for m in MODULES:
+        visit(m)

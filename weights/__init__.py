@@ -1,1 +1,0 @@
-"""Trained networks that are no character's, as package data."""
