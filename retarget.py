@@ -157,7 +157,7 @@ def headset(char: Character) -> np.ndarray:
     return data.site_xpos[char.sensor_sites[0]].copy()
 
 
-# From a standing human's hips to the headset, in the heading frame [m]: Bandai's actor and the built-in human, rounded
+# From a standing human's hips to the headset, heading frame [m]: Bandai's actor and the built-in human, rounded
 HEADSET_AHEAD = np.array([0.14, 0.0, 0.0])
 
 
@@ -165,7 +165,7 @@ def standing(char: Character, pos, quat) -> np.ndarray:
     """The default pose under headsets, turned as they look, feet on the floor: where a stream begins.
 
     ASSUMED   the root stands where the user's hips are, HEADSET_AHEAD behind the headset, as in training (§3.4: travel
-              is not scaled), and not where the character's own headset would be under the user's: Dino's is 0.38 m ahead
+              is not scaled), not where the character's own headset would be under the user's: Dino's is 0.38 m ahead
     Args      pos (N, 3) [m], quat (N, 4) of headsets, world
     Returns   qpos (N, 7 + j)
     Test      tests/headset/test_stream.py::test_stand, tests/test_env.py::test_standing_starts

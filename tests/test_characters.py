@@ -13,7 +13,6 @@ from test_retarget import MINI_TOML, MINI_XML, clip_of, posed, random_states
 
 import character
 import metrics
-import play
 import retarget
 from character import CHARACTERS
 from env import Env
@@ -702,7 +701,7 @@ def test_fourth_character(tmp_path, capsys):
     human = Rotation.from_quat(clip.quat[20, 0], scalar_first=True)  # pelvis
     assert (Rotation.from_quat(d.xquat[c.root], scalar_first=True).inv() * human).magnitude() < 1e-6
     ref = retarget.reference(c, [clip])
-    row = metrics.measure(c, ref, play.kinematic(c, ref))
+    row = metrics.measure(c, ref, metrics.kinematic(c, ref))
     assert row["root_cm"] == 0.0 and np.isnan(row["sip_deg"]) and "| - |" in metrics.table({"kinematic": row})
     env = Env(c, ref, 4, threads=1)
     obs, _ = env.reset(0)
