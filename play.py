@@ -43,7 +43,7 @@ from mocap.rigs import HELP, Reading
 from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cli, given_flags, run_main
 from plumbing.files import atomic_write, check_folders
 from plumbing.runs import fmt_count
-from ppo import check_fits, load_policy, sensors_of, total_steps, trained_as
+from policy import check_fits, load_policy, sensors_of, total_steps, trained_as
 from retarget import Reference, forward_kinematics, sole_motion
 
 # flags that say something of a motion alone, or of a stream alone
