@@ -504,10 +504,12 @@ class Adam:
         r"""Continue from `state()`, bit for bit.
 
         Args      state : dict of arrays
-        Raises    ValueError: keys or shapes differ
+        Raises    ValueError: keys or shapes differ, or t or v is negative
         Test      tests/test_nn.py::test_adam_resume
         """
         arrays = _load_arrays("Adam", state, {"t": np.array(self.t), "m": self.m, "v": self.v})
+        if not (arrays["t"] >= 0 and np.all(arrays["v"] >= 0)):
+            raise ValueError(f"Adam state has t = {arrays['t']} and a least v of {arrays['v'].min(initial=0.0):g}")
         self.t, self.m, self.v = int(arrays["t"]), arrays["m"], arrays["v"]
 
 

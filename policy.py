@@ -153,6 +153,42 @@ def check_fits(policy: Policy, env, path):
         )
 
 
+def check_exact(policy: Policy, meta, path, opt, env):
+    """UserError unless a policy can go on as it is: the same character, and sizes of all layers.
+
+    Args      opt : character, hidden, value_hidden of the run; env : the sizes of its observations and actions
+    Test      tests/test_ppo.py::test_init_fine_tunes, test_init_points_to_carry"""
+    own, names = trained_as(meta, path), ("obs_size", "critic_size", "action_size", "hidden", "value_hidden")
+    need = {name: getattr(env if name.endswith("size") else opt, name) for name in names}
+    odd = [f"{k} {getattr(policy, k)}, not {need[k]}" for k in names if getattr(policy, k) != need[k]]
+    if own and Path(own.character).stem != Path(opt.character).stem:
+        odd = [f"it is {Path(own.character).stem}'s", *odd]
+    if odd:
+        make = f"python -m extras.policies carry {path} NEW.npz --character {opt.character}"
+        raise UserError(f"{path}: does not fit {env.name}: {'; '.join(odd)}; this makes one that does: {make}")
+
+
+def initial(path, opt, env) -> tuple[Policy, int]:
+    """A policy to go on from, and the steps that it has seen: no σ below the run's, V in the environment's scale.
+
+    Args      opt : of the run (`check_exact`), with gamma and min_sigma
+    Raises    UserError: of another character, or other sizes
+    Test      tests/test_ppo.py::test_init_fine_tunes"""
+    policy, meta = load_policy(path)
+    check_exact(policy, meta, path, opt, env)
+    policy.norm.frozen, policy.value_scale = False, env.value_scale(opt.gamma)
+    np.maximum(policy.log_std, np.log(opt.min_sigma), out=policy.log_std)
+    return policy, total_steps(meta)
+
+
+def widths(path) -> dict:
+    """The hidden layers of a policy's two networks, by the names of the options.
+
+    Test      tests/test_ppo.py::test_init_brings_its_widths"""
+    policy, _ = load_policy(path)
+    return {"hidden": policy.hidden, "value_hidden": policy.value_hidden}
+
+
 def trained_as(meta, path) -> character.Switches | None:
     """Which character, with which variation, a policy was trained for; None where its file names none.
 
