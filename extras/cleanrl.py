@@ -27,7 +27,7 @@ import ppo
 from extras.gym_env import Task
 from nn import ACTIVATIONS, Adam, clip_grad_norm, gaussian_kl
 from plumbing.cli import ALL_POSITIVE, COUNT, NONNEGATIVE, POSITIVE, UNIT, UserError, arg, cli, run_main
-from plumbing.runs import check_run
+from plumbing.runs import check_run, latest_checkpoint
 from plumbing.training import progress_line, resumed_options
 from policy import Policy, check_fits, load_policy, total_steps
 
@@ -62,7 +62,7 @@ class Options:
     sigma: float = arg(1.0, "standard deviation of the exploration noise at the start", check=POSITIVE)
     min_sigma: float = arg(1e-6, "below this the standard deviations do not fall", check=POSITIVE)
     activation: str = arg("tanh", "of the hidden layers", choices=tuple(ACTIVATIONS))
-    schedule: str = arg("linear", "learning rates: linear, to 0 at --steps, or by --target-kl", choices=("linear", "kl"))
+    schedule: str = arg("linear", "learning rates: linear, to 0 at --steps, or by --target-kl", ("linear", "kl"))
     adam_eps: float = arg(1e-5, "epsilon of Adam", check=POSITIVE)
     value_clip: bool = arg(True, "clip the value's change, too, by --clip-eps")
     joint_clip: float | None = arg(0.5, "clip both gradients by one norm, the value's times this", check=POSITIVE)
@@ -196,8 +196,8 @@ def main(argv=None):
     check_run(opt.out, opt.resume)
     opt = resumed_options(opt, argv) if opt.resume else opt
     env = make_env(opt)
-    policy, before = initial(opt, env) if opt.init and not opt.resume else (None, 0)
-    loaded = ppo.runs.latest_checkpoint(opt.out, ppo.FINITE) if opt.resume else None
+    loaded = latest_checkpoint(opt.out, ppo.FINITE) if opt.resume else None
+    policy, before = initial(opt, env) if opt.init and not loaded else (None, 0)
     ppo.run(Trainer(opt, env, policy), loaded, before)
 
 
