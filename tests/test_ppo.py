@@ -352,13 +352,6 @@ def test_epochs_and_rate_follow_kl(char, ref):
     assert t.adam_pi.lr == 2e-3
 
 
-def test_play_clips_observations_as_training(char, ref):
-    t = trainer_of(char, ref)
-    far = t.env.full + 100.0
-    want = t.policy.actor(t.policy.norm.normalise(far)[:, : t.env.obs_size])
-    np.testing.assert_allclose(t.policy.mean_action(far[:, : t.env.obs_size]), want, rtol=1e-5, atol=1e-6)
-
-
 def test_time_to_failure(char, ref):
     t = trainer_of(char, ref, envs=32, horizon=30)
     stats = t.collect()
