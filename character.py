@@ -33,7 +33,7 @@ SOLVERS = {  # ASSUMED: of contacts, with iterations at most: MuJoCo's exact one
     "pgs": (mujoco.mjtSolver.mjSOL_PGS, 5),
 }
 RECIPE = {"by": (str, (lambda v: v.startswith("extras."), 'the name of a module in extras, as "extras.train"'))}
-RECIPE |= {  # what [training] may hold: options of ppo.py, and of the module that `by` names -> kind, (test, what is valid)
+RECIPE |= {  # [training]: options of ppo.py and of the module that `by` names -> kind, (test, what is valid)
     key: (kind, check)
     for kind, check, keys in (
         (float, POSITIVE, "lr value_lr target_kl sigma min_sigma root_limit"),

@@ -439,7 +439,7 @@ def main(argv=None):
     """python ppo.py: train by the character's recipe, or resume.  Test: tests/robustness/test_cli.py::test_ppo"""
     module = training.trained_by(character.Switches, argv, Options.BY)
     if module != Options.BY:
-        print(f"trained by {module} (--recipe none: by ppo.py's own defaults)")
+        print(f"trained by {module}, as the recipe or the run says (--recipe none: by ppo.py's own defaults)")
         return training.main_of(module)(argv)
     opt = training.read_options(Options, argv, "ppo.py", __doc__, widths)
     train(opt, make_env(opt))

@@ -260,7 +260,7 @@ def make(task):
 
     Raises    UserError: gymnasium, or what the task needs, is not installed; no such task; its actions or observations
               are no numbers
-    Test      tests/extras/test_gym_env.py::test_wrong_tasks"""
+    Test      tests/extras/test_cleanrl.py::test_wrong_tasks"""
     need_gymnasium()
     try:
         made = gymnasium.make(task, disable_env_checker=True)
@@ -344,7 +344,8 @@ class Task:
 
         A reward or an observation that is not finite ends the episode as a failure.
         Raises    ValueError: an action is not finite
-        Test      tests/extras/test_gym_env.py::test_task_is_the_task, test_non_finite_task"""
+        Test      tests/extras/test_gym_env.py::test_task_is_the_task,
+                  tests/extras/test_cleanrl.py::test_non_finite_task"""
         if not np.isfinite(action).all():
             raise ValueError(f"action of copy {int(np.argmin(np.isfinite(action).all(1)))} is not finite")
         clipped = np.clip(action, self.low, self.high).astype(self.dtype)  # only the task sees clipped actions

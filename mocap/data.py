@@ -99,7 +99,7 @@ def parts(motion) -> list[str]:
 def licences(sets) -> list[str]:
     """Of each data set that is not built in: its name, and the first line of the licence file beside it.
 
-    Test      tests/mocap/test_mocap.py::test_licences, tests/test_ppo.py::test_ship
+    Test      tests/mocap/test_mocap.py::test_licences, tests/extras/test_policies.py::test_ship
     """
     out = []
     for path in (Path(s) for s in sets if s not in BUILTIN):

@@ -59,7 +59,8 @@ def test_blended(tmp_path):
     obs = np.random.default_rng(0).standard_normal((5, load_policy(paths[0])[0].obs_size)).astype(np.float32)
     old, new = (load_policy(p)[0] for p in paths)
     for share, like in ((0.0, new), (1.0, old)):
-        assert policies.ship(paths[1], tmp_path / "b.npz", paths[:1], share)["blend"] == {"with": ["old"], "share": share}
+        meta = policies.ship(paths[1], tmp_path / "b.npz", paths[:1], share)
+        assert meta["blend"] == {"with": ["old"], "share": share}
         got = load_policy(tmp_path / "b.npz")[0]
         np.testing.assert_allclose(got.mean_action(obs), like.mean_action(obs), atol=1e-5)
     policies.main(["blend", str(tmp_path / "b.npz"), str(paths[1]), str(paths[0]), "--share", "0.25"])
