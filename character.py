@@ -22,7 +22,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from human import SEG, SEGMENTS, quat_mul
-from plumbing.cli import POSITIVE, UserError, arg
+from plumbing.cli import ALL_POSITIVE, COUNT, NONNEGATIVE, POSITIVE, UNIT, UserError, arg
 from plumbing.files import read_text, read_toml
 
 CHARACTERS = Path(__file__).resolve().parent / "characters"
@@ -31,6 +31,20 @@ TAILS = ("active", "fixed", "passive")  # [Reda23 §5.1, Fig. 8]
 SOLVERS = {  # ASSUMED: of contacts, with iterations at most: MuJoCo's exact one; a faster one under which feet creep
     "newton": (mujoco.mjtSolver.mjSOL_NEWTON, 100),
     "pgs": (mujoco.mjtSolver.mjSOL_PGS, 5),
+}
+RECIPE = {"by": (str, (lambda v: v.startswith("extras."), 'the name of a module in extras, as "extras.train"'))}
+RECIPE |= {  # [training]: options of ppo.py and of the module that `by` names -> kind, (test, what is valid)
+    key: (kind, check)
+    for kind, check, keys in (
+        (float, POSITIVE, "lr value_lr target_kl sigma min_sigma root_limit"),
+        (float, UNIT, "gamma lam retry stand begin"),
+        (float, (lambda v: 0 < v < 1, "between 0 and 1"), "clip_eps"),
+        (float, NONNEGATIVE, "sensor_noise sensor_offset push"),
+        (int, COUNT, "envs horizon minibatch epochs episode"),
+        (list, ALL_POSITIVE, "hidden value_hidden"),
+        (bool, None, "balance augment visits"),
+    )
+    for key in keys.split()
 }
 
 
@@ -68,7 +82,7 @@ class Character:
     contact_adr: np.ndarray  # (2,) address of the normal force in sensordata
     sensor_sites: np.ndarray  # (3,)
     fall_geoms: np.ndarray  # (f,) collision geoms that must not touch the floor
-    training: dict  # exploration noise to learn with (ours): sigma, min_sigma, where the TOML says
+    training: dict  # the recipe (ours): hyper-parameters to learn with, by RECIPE's names, where the TOML says
 
     @property
     def j(self):
@@ -280,7 +294,7 @@ class _Loader:
         fall=("bodies",),
         pose=None,
         metrics=("sip",),
-        training=("sigma", "min_sigma"),
+        training=tuple(RECIPE),
     )
     TABLES = tuple(t for t in KEYS if t not in ("pose", "metrics", "training"))  # those that must be there
     PARTS = (
@@ -443,10 +457,23 @@ class _Loader:
             for key in value if self.KEYS.get(name) and isinstance(value, dict) else ():
                 if key not in self.KEYS[name]:
                     self.complain(f"[{name}] has {key!r}, which means nothing; valid: {', '.join(self.KEYS[name])}")
-        with suppress(_Stop):
-            for key, value in self.table("training").items():
-                if self.number(f"[training] {key}", value) <= 0:
-                    self.complain(f"[training] {key} = {value!r} must be greater than 0")
+        for key in RECIPE:
+            with suppress(_Stop):
+                if key in self.table("training"):
+                    self.recipe_entry(key, self.table("training")[key])
+
+    def recipe_entry(self, key, value):
+        """Kind and range of one entry of [training]."""
+        where, (kind, check) = f"[training] {key}", RECIPE[key]
+        if kind is float:
+            self.number(where, value)
+        elif type(value) is not kind:
+            valid = {str: "text", int: "an integer", list: "a list of integers", bool: "true or false"}[kind]
+            self.fail(f"{where} = {value!r} is not {valid}")
+        if kind is list and not all(type(v) is int for v in value):
+            self.fail(f"{where} = {value!r} must be integers, as in [512, 256]")
+        if check and not check[0](value):
+            self.fail(f"{where} = {value!r} must be {check[1]}")
 
     def mjspec(self, visual=True) -> mujoco.MjSpec:
         """The MJCF with the variations; without the shapes that are only looked at, which cost time in every step."""

@@ -47,7 +47,7 @@ from mocap.rigs import HELP, Reading
 from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cli, run_main
 from plumbing.files import atomic_write, check_folders
 from plumbing.runs import fmt_count
-from ppo import check_fits, load_policy, sensors_of, total_steps, trained_as
+from policy import check_fits, load_policy, sensors_of, total_steps, trained_as
 from retarget import Reference, forward_kinematics, reference, sole_motion
 
 ROWS = ("streamed", "tracked", "kinematic", "zero", "pd")

@@ -43,7 +43,7 @@ from mocap.data import CONTROL_RATE
 from mocap.rigs import Reading
 from plumbing.cli import NONNEGATIVE, POSITIVE, UserError, arg, cli, given_flags, run_main
 from plumbing.files import atomic_write, check_folders
-from ppo import check_fits
+from policy import check_fits
 from retarget import Reference, forward_kinematics
 
 # flags that say something of a motion alone, or of a stream alone

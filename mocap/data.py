@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import re
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -26,9 +26,9 @@ import numpy as np
 from human import Clip, resample
 from mocap import bvh, gait
 from mocap.guess import _unknown
-from mocap.rigs import AS_IT_IS, RIGS, _unit, canonical, from_amc, is_amc, read, rig_of
+from mocap.rigs import AS_IT_IS, HELP, RIGS, _unit, canonical, from_amc, is_amc, read, rig_of
 from mocap.stitch import stitch
-from plumbing.cli import UserError
+from plumbing.cli import UserError, arg
 
 CONTROL_RATE = 30.0  # Hz, ASSUMED: Table 3 is not in the text we have
 
@@ -69,6 +69,17 @@ BUILTIN = {"builtin": gait.MIX, "standing": gait.STANDING}  # the data sets that
 MOTION = "builtin, standing, a .bvh or .amc file, or a folder of them; or several with commas between them"
 
 
+@dataclass
+class MotionFlags:
+    """The flags of every command that reads motion: which, and what the user says of its files."""
+
+    motion: str = arg("builtin", MOTION)
+    clips: str = arg("*", "shell pattern on clip names, such as '*walk*'")
+    joint_map: str | None = arg(None, HELP["joint_map"])
+    unit: str | None = arg(None, HELP["unit"])
+    up: str | None = arg(None, HELP["up"])
+
+
 def builtin_clips(rate=CONTROL_RATE, seed=0, name="builtin") -> list[Clip]:
     """The procedural human of mocap/gait.py: people who walk (builtin) or stand and step (standing).
 
@@ -102,7 +113,7 @@ def parts(motion) -> list[str]:
 def licences(sets) -> list[str]:
     """Of each data set that is not built in: its name, and the first line of the licence file beside it.
 
-    Test      tests/mocap/test_mocap.py::test_licences, tests/test_ppo.py::test_ship
+    Test      tests/mocap/test_mocap.py::test_licences, tests/extras/test_policies.py::test_ship
     """
     out = []
     for path in (Path(s) for s in sets if s not in BUILTIN):

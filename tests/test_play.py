@@ -9,7 +9,6 @@ import pytest
 import character
 import metrics
 import play
-import ppo
 import retarget
 from env import Env, headset_only
 from headset.reader import controllers_hang
@@ -18,7 +17,7 @@ from mocap import data
 from plumbing import render
 from plumbing.cli import UserError
 from plumbing.runs import save_checkpoint
-from ppo import Policy
+from policy import Policy, load_policy
 
 COLUMNS = [key for key, *_ in metrics.COLUMNS]
 pytestmark = pytest.mark.usefixtures("motions_once")
@@ -341,7 +340,7 @@ def test_headset_only(char, ref, tmp_path):
     with pytest.raises(UserError, match="p: was trained with the headset alone"):
         metrics.shown_to(hmd, "p", ref, "full")
 
-    policy, _ = ppo.load_policy(save_policy(tmp_path / "hmd.npz", char, less, sensors="hmd"))
+    policy, _ = load_policy(save_policy(tmp_path / "hmd.npz", char, less, sensors="hmd"))
     opt = play.Options(random_starts=0, threads=1)
     seen = []
     act = lambda env: (seen.append(env.full.copy()), metrics.policy_action(policy)(env))[1]  # noqa: E731

@@ -58,7 +58,7 @@ from human import (
 from mocap.data import load
 from plumbing.cli import UserError, run_main
 from plumbing.runs import save_checkpoint
-from ppo import Policy
+from policy import Policy
 
 ROOT = Path(__file__).resolve().parents[2]
 XYZW = lambda q: np.roll(q, -1, axis=-1)  # noqa: E731

@@ -29,12 +29,12 @@ from mocap.data import load
 from plumbing import render
 from plumbing.cli import run_main
 from plumbing.runs import CHECKPOINT, CONFIG, METRICS, load_checkpoint, read_metrics, save_checkpoint
-from ppo import Policy
+from policy import Policy, load_policy
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = {"mocap": mocap_command, "retarget": retarget, "ppo": ppo, "play": play}
 RUNS = ("retarget", "ppo", "play")
-TINY = "--clips *stand* --envs 4 --horizon 4 --steps 16 --hidden 8 --value-hidden 8 --threads 1".split()
+TINY = "--recipe none --clips *stand* --envs 4 --horizon 4 --steps 16 --hidden 8 --value-hidden 8 --threads 1".split()
 
 
 pytestmark = pytest.mark.usefixtures("motions_once")
@@ -115,7 +115,8 @@ def test_bad_values(here, capsys):
     refuse(capsys, here, "mocap")
     refuse(capsys, here, "mocap", "dance")
     for flag, value in (("--envs", "0"), ("--lr", "-1"), ("--gamma", "2"), ("--steps", "many"), ("--hidden", "8,0")):
-        assert flag in refuse(capsys, here, "ppo", flag, value)
+        for recipe in ((), ("--recipe", "none")):
+            assert flag in refuse(capsys, here, "ppo", *recipe, flag, value)
     assert "did you mean --envs" in refuse(capsys, here, "ppo", "--env", "4")
     assert "window" in refuse(capsys, here, "play", "--view", "hologram")
     assert "train, validation, style" in refuse(capsys, here, "play", "--measure", "--split", "test").replace("'", "")
@@ -383,7 +384,7 @@ def test_ppo_default_folder(here, capsys):
     assert "100.0%" in capsys.readouterr().out
     assert run("ppo", "--resume", "--steps", 48) == 0  # the same folder, its own options
     assert read_metrics(here / "runs" / "jesse" / METRICS)["steps"].tolist() == [16, 32, 48]
-    policy, meta = ppo.load_policy("runs/jesse")
+    policy, meta = load_policy("runs/jesse")
     assert policy.hidden == (8,) and meta["steps"] == 48
 
 
