@@ -17,37 +17,32 @@ import json
 import re
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import mujoco
 import numpy as np
 
-import character
 import mocap.data
 from character import Character, Switches, joint_group, numberless
 from env import EPISODE_STEPS, SENSORS, Env, headset_only
-from headset.calibration import Stream
-from headset.player import ride
-from headset.reader import Sample, controllers_hang
+from headset.player import ride, stream_of
+from headset.reader import controllers_hang
 from human import (
     CONTACT_SPEED,
     angular_velocity,
     heading,
-    place,
     quat_angle,
     quat_conj,
     quat_mul,
     quat_rotate,
-    sensors,
 )
 from human import footfalls as footfalls_apart
-from mocap.augment import begins_in_motion, lead, resize
-from mocap.data import MOTION
-from mocap.rigs import HELP, Reading
-from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cli, run_main
+from mocap.augment import resize
+from mocap.data import MotionFlags
+from mocap.rigs import Reading
+from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cell, cli, markdown, run_main
 from plumbing.files import atomic_write, check_folders
 from plumbing.runs import fmt_count
-from policy import check_fits, load_policy, sensors_of, total_steps, trained_as
+from policy import check_fits, devices_of, find_policy, load_character, load_policy, sensors_of, total_steps
 from retarget import Reference, forward_kinematics, reference, sole_motion
 
 ROWS = ("streamed", "tracked", "kinematic", "zero", "pd")
@@ -333,11 +328,9 @@ def comparison(results: dict) -> str:
 
 def _markdown(rows, results) -> str:
     """Rows of text, the first the heading, and a line about the human."""
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
-    lines.insert(1, "|---" * len(rows[0]) + "|")
     human = next((v for k, v in results.items() if k.startswith("kinematic")), [*results.values()][-1])  # every frame
     jitter, pace = cell(human["human_jitter_m_s3"], "{:.0f}"), cell(human["human_steps_per_m"], "{:.2f}")
-    return "\n".join([*lines, f"\nthe human: jitter {jitter} m/s³, {pace} steps/m; {human['clips']} sequences"])
+    return f"{markdown(rows)}\n\nthe human: jitter {jitter} m/s³, {pace} steps/m; {human['clips']} sequences"
 
 
 def cells(name, row) -> list[str]:
@@ -345,11 +338,6 @@ def cells(name, row) -> list[str]:
     kinematic = ("completed", "survival", "fails_every_s", "torque_rms", "saturation")
     dash = kinematic if name.startswith("kinematic") else ()
     return ["-" if k in dash else cell(row.get(k, np.nan), fmt) for k, _, fmt in COLUMNS]
-
-
-def cell(value, fmt):
-    """A number as text: a dash for NaN, `never` for infinity."""
-    return "-" if np.isnan(value) else "never" if value == np.inf else fmt.format(value)
 
 
 def as_json(results: dict) -> str:
@@ -555,29 +543,6 @@ def time_to_failure(char, ref, act, n=256, seconds=20.0, seed=0, threads=0) -> f
 
 # ------------------------------------------------------------------------------------ as a user plays it
 
-STANDS, SETS_OFF, CAPTURE = 1.5, 1.5, 20.0  # s of a streamed sequence: still, speeding up, of the capture at most
-
-
-def stream_of(char: Character, clip, devices=3):
-    r"""What a headset's recording of a clip makes of it: poses at the control rate, and the human where they are.
-
-    Method    the clip with its lead-in (`mocap.augment.lead`; no speeding up where it begins still), its devices as
-              samples through `headset.calibration.Stream`, as a file's are; the calibrating second is not played
-    Returns   pos (T, 3, 3), quat (T, 3, 4) in the character's world; the clip in the same world, T frames; scale (3,)
-    Test      tests/test_metrics.py::test_streamed
-    """
-    whole = clip[: round(CAPTURE * clip.rate) + 1]
-    led = lead(whole, STANDS, SETS_OFF if begins_in_motion(whole) else 0.0)
-    stream = Stream(char, "mujoco", rate=clip.rate, devices=devices)
-    pos, quat = sensors(led)
-    ticks = []
-    for k in range(len(led)):
-        ticks += stream.push(Sample(k / clip.rate, pos[k], np.roll(quat[k], -1, axis=-1)))
-    c = stream.calibration
-    seen = place(led, -c.yaw, c.origin[:2], np.zeros(2))[len(led) - len(ticks) :]
-    return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks]), seen, c.scale
-
-
 def streamed(char: Character, act, clips, devices=3, threads=0) -> dict:
     """The row `streamed` of spec/metrics: driven by sensors alone, from the default pose, with a lead-in.
 
@@ -613,40 +578,6 @@ def streamed(char: Character, act, clips, devices=3, threads=0) -> dict:
 # ------------------------------------------------------------------------------------ which policy
 
 
-def find_policy(opt: Options):
-    """The policy named, or the shipped one, its path and what its file says; UserError says how to make one."""
-    name = Path(opt.character or "jesse")
-    shipped = name.with_suffix(".npz") if name.suffix == ".toml" else character.CHARACTERS / f"{name}.npz"
-    path = Path(opt.policy) if opt.policy else shipped
-    if not path.exists():
-        character.load(str(name))  # a wrong name, or a broken character, is the better complaint
-        make = f"python ppo.py --character {name} --out runs/a"
-        raise UserError(f"no policy {path}: train one ({make}), then --policy runs/a")
-    policy, meta = load_policy(path)
-    return policy, path, meta
-
-
-def load_character(opt: Options, meta, path) -> Character:
-    """The character that the flags ask for; where they ask for nothing, the policy's own with its variation.
-
-    A flag changes that one thing; another character has none of the policy's variations.
-    Test      tests/test_play.py::test_character_of_the_policy"""
-    own = trained_as(meta, path) or Switches()
-    base = own if opt.character in (None, own.character) else Switches(opt.character)
-    given = {k: v for k in ("tail", "scale", "set") if (v := getattr(opt, k)) != getattr(Switches(), k)}
-    return replace(base, **given).load()
-
-
-def devices_of(meta, path, sensors: str | None) -> int:
-    """How many devices a policy was trained with, 3 or 1.  UserError: fewer than `sensors` "full" asks for
-
-    Test      tests/test_play.py::test_headset_only"""
-    devices = 1 if sensors_of(meta, path) == "hmd" else 3
-    if devices == 1 and sensors == "full":
-        raise UserError(f"{path}: was trained with the headset alone: leave out --sensors, or give --sensors hmd")
-    return devices
-
-
 def shown_to(meta, path, ref: Reference, sensors: str | None) -> Reference:
     """What a policy is shown of the user: the devices it was trained with; with `sensors` "hmd" controllers hang.
 
@@ -662,15 +593,10 @@ MOST = 96  # captures of a streamed row, evenly chosen
 
 
 @dataclass
-class Options(Switches):
+class Options(MotionFlags, Switches):
     """Which policy, on which motion."""
 
     character: str | None = arg(None, "name in characters/, or path of a .toml; the policy's own by default, or jesse")
-    motion: str = arg("builtin", MOTION)
-    clips: str = arg("*", "shell pattern on clip names")
-    joint_map: str | None = arg(None, HELP["joint_map"])
-    unit: str | None = arg(None, HELP["unit"])
-    up: str | None = arg(None, HELP["up"])
     policy: str | None = arg(None, "run folder or policy .npz; characters/NAME.npz by default")
     compare: tuple[str, ...] = arg((), "several of them: a table, and with --png a figure", metavar="A B …")
     sensors: str | None = arg(

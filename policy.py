@@ -8,12 +8,13 @@ A policy's file holds the weights and the normaliser, and says which character i
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 
 import character
+from character import Character, Switches
 from env import SENSORS
 from nn import ACTIVATIONS, MLP, RunningNorm
 from plumbing.cli import UserError
@@ -189,7 +190,7 @@ def widths(path) -> dict:
     return {"hidden": policy.hidden, "value_hidden": policy.value_hidden}
 
 
-def trained_as(meta, path) -> character.Switches | None:
+def trained_as(meta, path) -> Switches | None:
     """Which character, with which variation, a policy was trained for; None where its file names none.
 
     Raises    UserError: its options are damaged
@@ -197,11 +198,11 @@ def trained_as(meta, path) -> character.Switches | None:
     options = meta.get("options")
     if not isinstance(options, dict) or "character" not in options:
         return None
-    found = {f.name: options.get(f.name, f.default) for f in fields(character.Switches)}
+    found = {f.name: options.get(f.name, f.default) for f in fields(Switches)}
     texts = [found["character"], found["tail"] or "", found["set"] or ""]
     if not all(isinstance(t, str) for t in texts) or type(found["scale"]) not in (int, float) or not found["scale"] > 0:
         raise UserError(f"{path}: its options name no character: {str(found)[:200]}; valid: what ppo.py wrote")
-    return character.Switches(**found)
+    return Switches(**found)
 
 
 def sensors_of(meta, path) -> str:
@@ -220,3 +221,40 @@ def total_steps(meta) -> int:
 
     Test      tests/extras/test_policies.py::test_ship"""
     return sum(meta[k] for k in ("steps", "before") if type(meta.get(k)) is int)
+
+
+# ------------------------------------------------------------------------------------ which policy is meant
+
+
+def find_policy(opt):
+    """The policy named, or the shipped one, its path and what its file says; UserError says how to make one."""
+    name = Path(opt.character or "jesse")
+    shipped = name.with_suffix(".npz") if name.suffix == ".toml" else character.CHARACTERS / f"{name}.npz"
+    path = Path(opt.policy) if opt.policy else shipped
+    if not path.exists():
+        character.load(str(name))  # a wrong name, or a broken character, is the better complaint
+        make = f"python ppo.py --character {name} --out runs/a"
+        raise UserError(f"no policy {path}: train one ({make}), then --policy runs/a")
+    policy, meta = load_policy(path)
+    return policy, path, meta
+
+
+def load_character(opt, meta, path) -> Character:
+    """The character that the flags ask for; where they ask for nothing, the policy's own with its variation.
+
+    A flag changes that one thing; another character has none of the policy's variations.
+    Test      tests/test_play.py::test_character_of_the_policy"""
+    own = trained_as(meta, path) or Switches()
+    base = own if opt.character in (None, own.character) else Switches(opt.character)
+    given = {k: v for k in ("tail", "scale", "set") if (v := getattr(opt, k)) != getattr(Switches(), k)}
+    return replace(base, **given).load()
+
+
+def devices_of(meta, path, sensors: str | None) -> int:
+    """How many devices a policy was trained with, 3 or 1.  UserError: fewer than `sensors` "full" asks for
+
+    Test      tests/test_play.py::test_headset_only"""
+    devices = 1 if sensors_of(meta, path) == "hmd" else 3
+    if devices == 1 and sensors == "full":
+        raise UserError(f"{path}: was trained with the headset alone: leave out --sensors, or give --sensors hmd")
+    return devices
