@@ -211,14 +211,16 @@ def clips_of(opt: Options) -> list:
     """The stitched training sequences; with `augment` twice, with `visits` every single clip as a visit, too.
 
     Test      tests/extras/test_train.py::test_clips"""
-    reading = Reading.of(opt)
-    say(f"reading {opt.motion}")
-    clips = data.sequences(opt.motion, "train", opt.clips, seed=opt.seed, reading=reading)
+    reading, single, clips = Reading.of(opt), [], []
+    for each in data.parts(opt.motion):  # as `data.sequences`, but the single clips are wanted, too, and read once
+        say(f"reading {each}")
+        found = data.load(each, clips=opt.clips, split="train", reading=reading)
+        single += found
+        clips += found if len(found) == 1 else data._sequences(found, f"{each} [train]", opt.seed)
     if opt.augment:
         say(f"augmenting {len(clips)} sequences")
         clips = augment.augment(clips, np.random.default_rng([opt.seed, 3]))
     if opt.visits or opt.begin:
-        single = data.load(opt.motion, clips=opt.clips, split="train", reading=reading)
         single = [c for c in single if c.seconds >= SHORTEST]
         if not single:
             raise UserError(f"--motion {opt.motion}: no clip of {SHORTEST:g} s or more to make a visit of")

@@ -249,6 +249,10 @@ def test_clips(tmp_path, capsys):
     """As they are; with `augment` mirrored, too; with `begin` or `visits` every one as a visit, too, twice."""
     plain = train.clips_of(small())
     assert [c.name for c in plain] == ["stand_007"]
+    several = small(motion="builtin,standing", clips="*")
+    want = data.sequences("builtin,standing", "train", seed=0, verbose=False)
+    for a, b in zip(train.clips_of(several), want, strict=True):  # as ppo.py's
+        assert a.name == b.name and np.array_equal(a.pos, b.pos)
     both = train.clips_of(small(augment=True))
     assert len(both) == 2 and "mirrored" in both[1].name and both[0].name == "stand_007"
     for more in ({"begin": 0.1}, {"visits": True}):
@@ -286,7 +290,7 @@ def test_cache(tmp_path, monkeypatch, capsys):
     folder = tmp_path / "motion"
     folder.mkdir()
     (folder / "take.bvh").write_text("1")
-    monkeypatch.setattr(data, "sequences", lambda *_, **__: [data.builtin_clips()[0][:40]])
+    monkeypatch.setattr(data, "load", lambda *_, **__: [data.builtin_clips()[0][:40]])
     jesse, opt = character.load("jesse"), small(tmp_path / "runs" / "a", motion=str(folder))
     made = train.reference_of(opt, jesse)
     assert "reading" in capsys.readouterr().out
@@ -319,7 +323,7 @@ def test_cache(tmp_path, monkeypatch, capsys):
 
 def test_damaged_cache(tmp_path, monkeypatch, capsys):
     """Whatever is wrong with it: one line, and it is made anew; never unpickled."""
-    monkeypatch.setattr(data, "sequences", lambda *_, **__: [data.builtin_clips()[0][:40]])
+    monkeypatch.setattr(data, "load", lambda *_, **__: [data.builtin_clips()[0][:40]])
     jesse, opt = character.load("jesse"), small(tmp_path / "a")
     want = train.reference_of(opt, jesse)
     [file] = (tmp_path / "cache").iterdir()
