@@ -148,7 +148,7 @@ def load(name: str | Path, tail: str | None = None, scale: float = 1.0, set=()) 
     variant = {"tail": tail} if tail else {}
     variant |= {"scale": float(scale)} if scale != 1 else {}
     variant |= {"set": [s.strip() for s in set]} if set else {}
-    c = SimpleNamespace(path=toml_of(name), variant=variant)
+    c = SimpleNamespace(path=toml_of(name), variant=variant, size=variant.get("scale", 1.0))
     for part in PARTS:
         part(c)
     return Character(**{f.name: getattr(c, f.name) for f in fields(Character)})
@@ -268,22 +268,26 @@ def table(c, name) -> dict:
 # Each finds some of Character's fields, in the TOML, the MJCF, and what the parts before it have found.
 
 
-def files(c):
-    """The TOML with its changes, and where the MJCF is."""
+def entries(c):
+    """The TOML, with its changes."""
     c.spec = read_toml(c.path, "a character's tables (TOML)")
     with in_toml(c):
         c.spec = toml.with_changes(c.spec, c.variant.get("set", ()))
-    c.name, c.size, c.training = str(c.spec.get("name", c.path.stem)), c.variant.get("scale", 1.0), {}
-    c.xml = c.path.parent / str(c.spec.get("model", c.path.stem + ".xml"))
-    if not c.xml.is_file():
-        there = ", ".join(sorted(p.name for p in c.path.parent.glob("*.xml"))) or "none"
-        raise fault(c, f"model = {c.xml.name!r} is not a file beside it; .xml files there: {there}")
 
 
 def tables(c):
     """The tables are there, and no others."""
     with in_toml(c):
         toml.check_keys(dict.fromkeys(["name?", "model?", *TABLES], True), (), c.spec)
+    c.name = str(c.spec.get("name", c.path.stem))
+
+
+def mjcf_file(c):
+    """Where the model is."""
+    c.xml = c.path.parent / str(c.spec.get("model", c.path.stem + ".xml"))
+    if not c.xml.is_file():
+        there = ", ".join(sorted(p.name for p in c.path.parent.glob("*.xml"))) or "none"
+        raise fault(c, f"model = {c.xml.name!r} is not a file beside it; .xml files there: {there}")
 
 
 def model(c):
@@ -426,7 +430,7 @@ def rest(c):
 def rewards(c):
     """Table 2, and Eq. 11's weights of links and of hinges; what has no human motion is not imitated (§3.5.1)."""
     said = table(c, "reward")
-    c.reward = {term: said[term] for term in ("fail", *TERMS)}
+    c.reward = {"fail": float(said["fail"])} | {term: said[term] for term in TERMS}
     c.reward_links, c.link_weights = np.array([*said["links"]], int), normalised([*said["links"].values()])
     joints = said.get("joints", {})
     weights = [joints.get(n, joints.get(joint_group(n), joints.get("default", 1.0))) for n in c.hinges]
@@ -463,8 +467,8 @@ def metrics(c):
 
 
 PARTS = (
-    files, tables, model, skeleton, floor, default_pose, torques, springs, root, joint_map, feet, rest, rewards, links,
-    devices, fall, training, metrics,
+    entries, tables, mjcf_file, model, skeleton, floor, default_pose, torques, springs, root, joint_map, feet, rest,
+    rewards, links, devices, fall, training, metrics,
 )  # fmt: skip
 
 

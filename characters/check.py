@@ -30,11 +30,11 @@ def check(name) -> list[str]:
     xml = path if path.suffix == ".xml" else None
     if xml and not xml.is_file():
         raise UserError(f"no file {xml}; give a character's .xml or .toml, or its name")
-    c = SimpleNamespace(path=xml.with_suffix(".toml") if xml else character.toml_of(name), variant={})
+    c = SimpleNamespace(path=xml.with_suffix(".toml") if xml else character.toml_of(name), variant={}, size=1.0)
     parts, found = character.PARTS, []
     if not c.path.is_file():
-        found.append(f"{c.path}: is not there")
-        c.xml, c.spec, c.size, parts = xml, {}, 1.0, parts[1:]
+        c.xml, c.spec, found = xml, {}, [f"{c.path}: is not there"]
+        parts = [part for part in parts if part not in (character.entries, character.mjcf_file)]
     for part in parts:
         found += complaint(c, part, c)
     if xml and hasattr(c, "xml") and c.xml.is_file() and not c.xml.samefile(xml):

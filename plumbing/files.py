@@ -275,7 +275,9 @@ def check_claims(path, seen=()):
 
 # ---- .npz ------------------------------------------------------------------------------------------------------------
 
-UNREADABLE = (OSError, EOFError, ValueError, KeyError, RuntimeError, MemoryError, zlib.error, struct.error)
+UNREADABLE = (
+    OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, MemoryError, zlib.error, struct.error
+)  # fmt: skip
 
 
 def read_arrays(path, expected) -> dict:

@@ -46,7 +46,7 @@ def compiled(spec: mujoco.MjSpec, xml) -> mujoco.MjModel:
             raise UserError(f"{xml}: {text}")
     with told(xml):
         m = spec.compile()
-    for name in "body_pos body_ipos body_mass body_inertia geom_pos geom_size jnt_pos site_pos".split():
+    for name in "body_pos body_ipos body_mass body_inertia geom_pos geom_size jnt_pos jnt_range site_pos".split():
         if not np.all(np.abs(getattr(m, name)) <= LARGEST):
             raise UserError(f"{xml}: its {name} holds NaN, or more than {LARGEST:g}; expected SI units")
     return m

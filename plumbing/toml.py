@@ -144,12 +144,14 @@ def kind_of_key(schema: dict, key):
 
 
 def check_keys(schema: dict, place, table):
-    """Every key of a table means something, and none that must be there is missing."""
+    """Every key of a table means something, and none that must be there is missing.
+
+    Args      place : () of the tables themselves"""
     check_table(place, table)
     odd = [repr(key) for key in table if not kind_of_key(schema, key)]
-    lacking = [key for key in schema if key not in table and not key.endswith("?")]
+    lacking = [key if place else f"[{key}]" for key in schema if key not in table and not key.endswith("?")]
     says = [f"{', '.join(odd)}, which means nothing"] if odd else []
-    says += [f"no {', '.join(lacking)}"] if lacking else []
+    says += [f"no {'' if place else 'table '}{', '.join(lacking)}"] if lacking else []
     if says:
         where, valid = f"[{'.'.join(place)}] " if place else "", ", ".join(key.rstrip("?") for key in schema)
         raise UserError(f"{where}has {', and '.join(says)}; valid: {valid}")

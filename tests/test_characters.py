@@ -484,7 +484,7 @@ def test_switches():
 
 TOML, XML = "jesse.toml", "jesse.xml"
 MUTATIONS = [  # what, file, old text, new text, what the one line must say
-    *[(f"no {t}", TOML, f"[{t}]", f"[gone_{t}]", (f"no {t}", "valid:")) for t in (
+    *[(f"no {t}", TOML, f"[{t}]", f"[gone_{t}]", (f"no table [{t}]", "valid:")) for t in (
         "root", "map", "passive", "observation", "feet", "sensors", "fall")],
     ("not a table", TOML, "[fall]", "[[fall]]", ("[fall] =", "is not a table")),
     ("broken TOML", TOML, "[root]", "[root", ("jesse.toml", "line")),
@@ -655,7 +655,7 @@ def test_check_command(tmp_path, thin_xml, capsys):
     (tmp_path / "bare.xml").write_text(thin_xml.replace('<freejoint name="root"/>', ""))
     assert check.main([str(tmp_path / "bare.xml")]) == 1
     out = capsys.readouterr().out
-    assert "bare.toml: is not there" in out and "has no root, map" in out
+    assert "bare.toml: is not there" in out and "has no table [root], [map]" in out
     assert "first joint must be free" in out
     (tmp_path / "other.toml").write_text((CHARACTERS / TOML).read_text())
     (tmp_path / XML).write_text(thin_xml)

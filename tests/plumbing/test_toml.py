@@ -44,6 +44,12 @@ def test_faults(table, says):
         toml.read(SCHEMA, ("t",), table)
 
 
+def test_tables_themselves():
+    """The tables of a file have no name."""
+    with pytest.raises(UserError, match=r"^has 'q', which means nothing, and no table \[a\]; valid: a, b$"):
+        toml.check_keys({"a": True, "b?": True}, (), {"q": {}})
+
+
 @pytest.mark.parametrize("reader,good,bad", [
     (toml.positive, 0.5, (0, -1, "1", True)),
     (toml.count, 3, (0, 1.0, 2.5, False)),
