@@ -34,8 +34,8 @@ def describe(clip: Clip) -> str:
 def inspect(path, reading=AS_IT_IS) -> None:
     """Print what a file or a folder holds.  Test: tests/mocap/test_mocap.py::test_inspect."""
     path = Path(path)
-    if path.is_dir():
-        clips = load(path, reading=reading)
+    if path.is_dir() or str(path) in data.BUILTIN:
+        clips = load(str(path), reading=reading)
         for clip in clips:
             print(describe(clip))
         _sequences(clips, f"{path} [all]")
@@ -61,7 +61,7 @@ def main(argv=None) -> None:
     )
     sub = parser.add_subparsers(dest="command", required=True)
     p = sub.add_parser("inspect", help="print skeleton, rate, length, speed and contacts")
-    p.add_argument("path", help="a .bvh or .amc file, or a folder of them")
+    p.add_argument("path", help="a .bvh or .amc file, a folder of them, builtin or standing")
     for name, text in rigs.HELP.items():
         p.add_argument("--" + name.replace("_", "-"), help=text)
     f = sub.add_parser("fetch", help="download a data set, its licence and citation first")

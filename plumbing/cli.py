@@ -1,4 +1,4 @@
-"""plumbing.cli."""
+"""Command lines: flags out of a dataclass, and one clear line for whatever a user gets wrong."""
 
 from __future__ import annotations
 

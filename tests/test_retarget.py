@@ -535,6 +535,7 @@ def test_reference(char, mini, clips):
         part, alone = slice(ref.first[k], ref.last[k] + 1), retarget.reference(char, [clip])
         for field in dataclasses.fields(ref)[4:-1]:
             np.testing.assert_array_equal(getattr(ref, field.name)[part], getattr(alone, field.name))
+        assert ref.still[k] == alone.still[0]
         scale = retarget.root_scale(char, clip.hip_height)
         for t in range(0, len(clip), 29):
             f = ref.first[k] + t

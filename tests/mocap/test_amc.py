@@ -475,17 +475,6 @@ def test_real_files(mocap_dir):
     assert time.process_time() - begin < 30
 
 
-def test_main(tmp_path, capsys):
-    asf, motion = write(tmp_path)
-    assert amc.main([str(asf), str(motion), "--bones"]) == 0
-    out = capsys.readouterr().out
-    assert "4 bones, 11 values a frame" in out and "leg: parent hip" in out and "2 frames" in out
-    assert amc.main([str(motion)]) == 1
-    motion.write_text("x")
-    assert amc.main([str(asf), str(motion), str(tmp_path / "none.amc")]) == 1
-    assert len(capsys.readouterr().err.splitlines()) == 3
-
-
 # ---------------------------------------------------------------- CMU's human, made up
 
 

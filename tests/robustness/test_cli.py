@@ -93,13 +93,12 @@ def test_help(script, capsys):
 def test_help_as_scripts():
     """From the shell, all at once; --help needs no OpenGL, no motion and no policy."""
     commands = [[f"{s}.py", "--help"] for s in SCRIPTS if s != "mocap"]
-    commands += [["-m", "mocap", "--help"], ["-m", "mocap", "inspect", "--help"]]
-    commands.append(["-m", "mocap", "fetch", "--help"])
+    commands += [["-m", "mocap", *command, "--help"] for command in ([], ["inspect"], ["fetch"])]
     started = [subprocess.Popen([sys.executable, *c], cwd=ROOT, stdout=-1, stderr=-1, text=True) for c in commands]
     for process, command in zip(started, commands):
         out, err = process.communicate(timeout=60)
         assert process.returncode == 0 and err == "", (command, err)
-        assert "usage: " + command[0] in out
+        assert "usage: " + (command[0] if command[0] != "-m" else "python -m " + command[1]) in out
 
 
 # ------------------------------------------------------------------------------------ what is wrong is said
@@ -246,7 +245,8 @@ def test_no_clip_matches(script, here, capsys):
 
 def test_too_short(here, capsys, monkeypatch):
     """Two frames are a motion, and no place to start from."""
-    monkeypatch.setattr(mocap.data, "sequences", lambda *_, **__: [load("builtin", clips="stand_007")[0][:2]])
+    short = [load("builtin", clips="stand_007")[0][:2]]
+    monkeypatch.setattr(mocap.data, "load", lambda *_, **__: short)  # under every script that makes sequences
     assert "three frames" in refuse(capsys, here, "ppo", *TINY, "--out", here / "run")
     policy = small_policy(here / "p.npz")
     assert "three frames" in refuse(capsys, here, "play", "--measure", "--policy", policy)

@@ -642,7 +642,7 @@ def playing(char, live):
                 finite(list(tick))
                 np.testing.assert_allclose(np.linalg.norm(tick.quat, axis=-1), 1.0, atol=1e-6)
                 if k < 20:
-                    player.step(tick.pos, tick.quat)
+                    player.step(tick.pos[None], tick.quat[None])
                     finite([player.qpos, player.qvel, player.obs])
         assert len(source.seen) <= 1000
         source.report()
