@@ -17,7 +17,7 @@ import json
 import os
 import sys
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as ppo.py does, and says why; before NumPy is loaded
@@ -29,6 +29,7 @@ import ppo
 import retarget
 from env import EPISODE_STEPS, ROOT_LIMIT, Env, Uniform, ablated, headset_only
 from extras import gpu
+from headset import body
 from mocap import augment, data
 from mocap.rigs import Reading
 from plumbing.cli import NONNEGATIVE, POSITIVE, UNIT, UserError, arg, run_main
@@ -41,6 +42,7 @@ from retarget import Reference
 RETRY, PLACES = (3, 60), 512  # ASSUMED: steps before a failure from which it is tried again; failures remembered
 MOST = 10.0  # ASSUMED: a beginning that fails more often than so many times the mean is drawn no more often for it
 SHORTEST = 1.0  # s of a clip that is made a visit
+PLAYERS_STAND = 1.5  # ASSUMED: s at a recording's beginning in which a player stands well enough to start under
 PUSH_SECONDS = 2.0  # mean time between pushes
 CODE = 1  # counts up when retargeting or augmenting changes what it makes: older caches are then made anew
 CHUNK = 100  # clips retargeted between two lines of progress
@@ -56,6 +58,9 @@ class Options(ppo.Options):
     retry: float = arg(0.0, "share of episodes that start up to 2 s before a place where one failed", check=UNIT)
     stand: float = arg(0.0, "share that start in the default pose under the headset, as a stream does", check=UNIT)
     begin: float = arg(0.0, "share that start so under a user who stands still before a visit", check=UNIT)
+    players: str | None = arg(
+        None, "also the people of a headset's recordings (a folder of .csv files), with bodies (headset/body.py)"
+    )
     visits: bool = arg(False, "also every clip with a user who stands before and after it; --begin has them, too")
     augment: bool = arg(False, "also mirrored clips at other speeds, by users of other heights and arm lengths")
     sensor_offset: float = arg(0.0, "constant error of device positions in an episode [m]", check=NONNEGATIVE)
@@ -226,6 +231,11 @@ def clips_of(opt: Options) -> list:
             raise UserError(f"--motion {opt.motion}: no clip of {SHORTEST:g} s or more to make a visit of")
         say(f"making visits of {len(single)} clips")
         clips = clips + augment.visits(single, np.random.default_rng([opt.seed, 5]))
+    if opt.players:
+        say(f"bodies for the recordings of {opt.players}")
+        people = body.players(opt.players)
+        clips = clips + augment.visits(people, np.random.default_rng([opt.seed, 6]))
+        clips += [replace(c, still=round(PLAYERS_STAND * c.rate)) for c in people]
     return clips
 
 
@@ -267,10 +277,10 @@ def key_of(opt: Options, char) -> str:
     Made of    the character's tables and model, the options that matter, name, size and time of every file, and CODE
     Test       tests/extras/test_train.py::test_cache
     """
-    m, names = char.model, ("motion", "clips", "joint_map", "unit", "up", "seed", "augment")
+    m, names = char.model, ("motion", "clips", "joint_map", "unit", "up", "seed", "augment", "players")
     asked = {name: getattr(opt, name) for name in names} | {"visits": opt.visits or opt.begin > 0}
     paths = [Path(p) for p in data.parts(opt.motion) if p not in data.BUILTIN]
-    paths += [Path(opt.joint_map)] if opt.joint_map else []
+    paths += [Path(p) for p in (opt.joint_map, opt.players) if p]
     found = (f for p in paths for f in (sorted(p.rglob("*")) if p.is_dir() else [p]) if f.is_file())
     files = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in found]
     tables = {k: v for k, v in char.spec.items() if k not in ("torque", "passive", "reward", "training")}

@@ -261,6 +261,17 @@ def test_clips(tmp_path, capsys):
     assert "making visits of 1 clips" in capsys.readouterr().out
 
 
+def test_players(monkeypatch, tmp_path):
+    """Recordings with bodies: each as two visits, and as it is, to be started under while the player stands."""
+    person = data.builtin_clips()[2][:90]
+    monkeypatch.setattr(body, "players", lambda folder: [person])
+    clips = train.clips_of(small(players=str(tmp_path)))
+    assert [c.still for c in clips[-1:]] == [45] and clips[-1].name == person.name
+    assert sum(c.name.endswith("-visit") for c in clips) == 2
+    keys = {train.key_of(small(players=p), character.load("jesse")) for p in (None, str(tmp_path))}
+    assert len(keys) == 2
+
+
 def test_short_clips_are_no_visits(monkeypatch):
     monkeypatch.setattr(data, "load", lambda *_, **__: [data.builtin_clips()[0][:20]])
     with pytest.raises(UserError, match="no clip of 1 s or more"):
@@ -411,7 +422,7 @@ def test_ppo_hands_on(tmp_path, capsys):
     ppo.main(["--character", "oppy", *tiny, "--steps", "64", "--out", str(out)])
     assert capsys.readouterr().out.startswith("trained by extras.train")
     config = read_config(out)["config"]
-    assert config["by"] == "extras.train" and config["balance"] is True and config["root_limit"] == 0.6
+    assert config["by"] == "extras.train" and config["balance"] is True and config["root_limit"] == 0.9
     assert config["hidden"] == [12] and config["sigma"] == 0.06
     ppo.main(["--resume", "--out", str(out), "--steps", "128"])
     arrays, meta = load_checkpoint(out / CHECKPOINT)
