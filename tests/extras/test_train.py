@@ -15,6 +15,7 @@ from character import TERMS
 from env import Env, Uniform, headset_only
 from extras import train
 from extras.train import Curriculum, Disturbance, Options
+from headset import body
 from mocap import augment, data
 from plumbing.cli import UserError, run_main
 from plumbing.runs import CHECKPOINT, load_checkpoint, read_config
