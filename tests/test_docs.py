@@ -25,7 +25,7 @@ MODULES = [".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__
 PATHS = dict(zip(MODULES, FILES, strict=True))
 OPEN = ("not yet", "not run yet", "missing")
 REPRODUCE = {"": "REPRODUCE.md", "DROP": "drop/REPRODUCE.md", "SAN": "skeletal/REPRODUCE.md"}  # prefix of ids -> file
-DOCUMENTS = [str(f.relative_to(ROOT)) for f in sorted([*ROOT.glob("*.md"), *ROOT.glob("*/*.md")])]
+DOCUMENTS = [str(f.relative_to(ROOT)) for f in sorted([*ROOT.glob("*.md"), *ROOT.glob("[a-z]*/*.md")])]
 LONGEST_LINE, LARGEST = 160, 60_000  # characters of a line of prose; bytes of REPRODUCE.md
 
 REQUIRED = (
@@ -296,7 +296,8 @@ def commands(text: str) -> list:
 
     `python FILE.py …`, `python -m PACKAGE.MODULE …`; a backslash at a line's end continues it."""
     text = re.sub(r"\\\n\s*", " ", text)
-    spans = re.findall(r"(?<!`)`([^`]*?\bpython [^`]+)`", text)
+    paragraphs = "\n".join(line for _, line in prose(text)) + "\n" + "\n\n".join(re.findall(r"^\|.*", text, re.M))
+    spans = [span for each in re.split(r"\n\s*\n", paragraphs) for span in quoted(each)]
     fenced = re.findall(r"^```[^\n]*\n(.*?)^```", text, re.M | re.S)
     lines = re.findall(r"^    +(\S.*)$", text, re.M) + [line for block in fenced for line in block.splitlines()]
     out = []
