@@ -424,7 +424,9 @@ def line_of(name, ends, row) -> str:
 
 
 def check_options(opt: Options, argv) -> None:
-    """UserError: flags that do not go together.  Test: tests/test_play.py::test_flags_that_do_not_go_together"""
+    """UserError: flags that do not go together.
+
+    Test      tests/robustness/test_cli.py::test_play_flags_that_would_do_nothing"""
     if not (opt.measure or opt.png or opt.video or opt.bvh or opt.view or opt.stream or opt.compare):
         raise UserError(
             "nothing to do: give --measure, --compare A B, --png OUT, --video OUT, --bvh OUT, --view or --stream FILE"

@@ -1,11 +1,15 @@
-"""REPRODUCE.md against the code and the tests: every name it gives exists, and nothing it owes is missing.
+"""The documents against the code and the tests: every name they give exists, and nothing they owe is missing.
 
+There are three REPRODUCE.md: the paper's at the top, DROP's in drop/, the skeleton-aware networks' in skeletal/.  The
+ids of the wings begin with DROP and SAN.
 Part 1's table is `id | what | code | test`.  `code` holds `module.name` or `file.toml [table] key`, `test` holds
 `tests/test_x.py::test_a`; a row without a test says `not yet`, `not run yet` or `missing`.  Part 2's tables are
 `id | not said | choice | where | why`.
+All documents: prose that can be read in an editor, and commands that exist.
 """
 
 import ast
+import dataclasses
 import importlib
 import re
 import tomllib
@@ -20,6 +24,9 @@ FILES = sorted([*ROOT.glob("*.py"), *(f for wing in WINGS for f in (ROOT / wing)
 MODULES = [".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for f in FILES]
 PATHS = dict(zip(MODULES, FILES, strict=True))
 OPEN = ("not yet", "not run yet", "missing")
+REPRODUCE = {"": "REPRODUCE.md", "DROP": "drop/REPRODUCE.md", "SAN": "skeletal/REPRODUCE.md"}  # prefix of ids -> file
+DOCUMENTS = [str(f.relative_to(ROOT)) for f in sorted([*ROOT.glob("*.md"), *ROOT.glob("[a-z]*/*.md")])]
+LONGEST_LINE, LARGEST = 160, 60_000  # characters of a line of prose; bytes of REPRODUCE.md
 
 REQUIRED = (
     *(f"Eq. {k}" for k in range(1, 12)),
@@ -35,7 +42,8 @@ REQUIRED = (
     *(f"metric {m}" for m in (
         "completed", "survival", "root_cm", "head_cm", "hands_cm", "joint_pos_cm", "head_deg", "joint_rot_deg",
         "sip_deg", "foot_slide_cm_s", "penetration_mm", "contact_agreement", "jitter_m_s3", "steps_per_m",
-        "head_wobble_deg_s", "torque_rms", "saturation",
+        "head_wobble_deg_s", "torque_rms", "saturation", "streamed", "own_slide_cm_s", "self_penetration_mm",
+        "spring_share", "fails_every_s", "first_failure_s",
     )),
     *(f"DROP Eq. {k}" for k in range(1, 17)),
     *("DROP Algorithm 1", "DROP §7 rotations"), *(f"DROP §8.{k}" for k in (1, 2, 3, 4, 5, 7)),
@@ -56,20 +64,28 @@ GAPS = (  # every GAP and ASSUMED of the specification, in its order
 # ------------------------------------------------------------------------------------ reading
 
 
+def document_of(row_id: str) -> str:
+    """Prefix of the document that a row belongs to: DROP, SAN, or nothing for the paper's own."""
+    return next((prefix for prefix in REPRODUCE if prefix and row_id.startswith(prefix)), "")
+
+
 @cache
-def part(number: int) -> str:
-    """Text of one of REPRODUCE.md's numbered parts."""
-    text = (ROOT / "REPRODUCE.md").read_text(encoding="utf-8")
+def part(number: int, document: str) -> str:
+    """Text of a numbered part of a document, given by its prefix."""
+    file = REPRODUCE[document]
+    text = (ROOT / file).read_text(encoding="utf-8")
     found = re.search(rf"^## {number}\. .*?(?=^## \d+\. |\Z)", text, re.M | re.S)
-    assert found, f"REPRODUCE.md has no part '## {number}. …'"
+    assert found, f"{file} has no part '## {number}. …'"
     return found[0]
 
 
 @cache
-def rows(number: int) -> tuple:
-    """Cells of all table rows of a part, headers and rules left out."""
+def rows(number: int, document: str | None = None) -> tuple:
+    """Cells of all table rows of a part, headers and rules left out; of one document, or of all three."""
+    if document is None:
+        return tuple(row for each in REPRODUCE for row in rows(number, each))
     out = []
-    for line in part(number).splitlines():
+    for line in part(number, document).splitlines():
         cells = [c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]]
         if cells and not set(cells[0]) <= set("-: ") and cells[0] != "id":
             out.append(tuple(cells))
@@ -153,24 +169,37 @@ def test_every_row_is_complete():
     assert rows(1) and not bad, "\n".join(bad)
 
 
+def test_rows_stand_in_their_own_document():
+    """Ids that begin with DROP in drop/REPRODUCE.md, with SAN in skeletal/REPRODUCE.md, all others at the top."""
+    bad = [
+        f"{REPRODUCE[prefix]}: {row[0]}"
+        for prefix in REPRODUCE
+        for number in (1, 2)
+        for row in rows(number, prefix)
+        if document_of(row[0]) != prefix
+    ]
+    assert not bad, "in the wrong document: " + ", ".join(bad)
+
+
 @pytest.mark.parametrize("wanted", REQUIRED)
 def test_nothing_of_the_specification_is_missing(wanted):
     """A row for every equation, table, threshold and metric; with code and test unless it is missing or not run."""
-    found = [r for r in rows(1) if r[0] == wanted]
-    assert found, f"REPRODUCE.md, part 1 has no row {wanted!r}"
+    document = document_of(wanted)
+    found = [r for r in rows(1, document) if r[0] == wanted]
+    assert found, f"{REPRODUCE[document]}, part 1 has no row {wanted!r}"
     if not wanted.startswith(MAY_BE_OPEN):
         assert any(quoted(r[2]) and quoted(r[3]) for r in found), f"{wanted} has no code or no test: {found}"
 
 
 def test_named_code_exists():
-    """Parts 1 and 2."""
+    """Parts 1 and 2 of every document."""
     names = {n for row in rows(1) for n in quoted(row[2])} | {n for row in rows(2) for n in quoted(row[3])}
     bad = sorted(filter(None, map(missing_code, names)))
     assert names and not bad, "\n".join(bad)
 
 
 def test_named_tests_exist():
-    """Part 1."""
+    """Part 1 of every document."""
     names = {n for row in rows(1) for n in quoted(row[3])}
     bad = sorted(filter(None, map(missing_test, names)))
     assert names and not bad, "\n".join(bad)
@@ -181,7 +210,7 @@ def test_named_tests_exist():
 
 def test_every_gap_is_listed_in_order():
     """The specification's gaps, in its order, each with a choice, a place and a reason."""
-    ids = [r[0] for r in rows(2)]
+    ids = [r[0] for r in rows(2, "")]
     missing = [g for g in GAPS if g not in ids]
     assert not missing, f"REPRODUCE.md, part 2 lacks {missing}"
     assert [i for i in ids if i in GAPS] == list(GAPS), "the gaps are not in the specification's order"
@@ -218,16 +247,119 @@ def assumptions_of_toml(path: Path):
 
 
 def test_every_assumed_is_listed():
-    """A word ASSUMED in the code obliges part 2 to name the function, constant or table it stands in."""
-    listed = {n for row in rows(2) for n in quoted(row[3])}
-    covers = lambda want: any(n == want or n.startswith((want + ".", want + " ")) for n in listed)  # noqa: E731
+    """A word ASSUMED in the code obliges part 2 to name the function, constant or table it stands in.
+
+    What stands in drop/ or skeletal/ may be named in that wing's REPRODUCE.md; all else in the one at the top."""
+    listed = {prefix: {n for row in rows(2, prefix) for n in quoted(row[3])} for prefix in REPRODUCE}
+    wing = {Path(file).parent.name: prefix for prefix, file in REPRODUCE.items() if prefix}
     bad = []
     sources = [(p, assumptions_of_python(p)) for p in FILES]
     sources += [(p, assumptions_of_toml(p)) for p in sorted((ROOT / "characters").glob("*.toml"))]
     for path, found in sources:
         where = path.relative_to(ROOT)
-        bad += [f"{where}:{line}: {' or '.join(want)}" for line, want in found if not any(map(covers, want))]
-    assert not bad, "REPRODUCE.md, part 2 does not name\n" + "\n".join(bad)
+        names = listed[""] | listed[wing.get(where.parts[0], "")]
+        for line, want in found:
+            if not any(n == w or n.startswith((w + ".", w + " ")) for n in names for w in want):
+                bad.append(f"{where}:{line}: {' or '.join(want)}")
+    assert not bad, "part 2 does not name\n" + "\n".join(bad)
+
+
+# ------------------------------------------------------------------------------------ sizes and commands
+
+
+def test_reproduce_is_short():
+    """The paper's own document can be read in one sitting."""
+    size = (ROOT / "REPRODUCE.md").stat().st_size
+    assert size <= LARGEST, f"REPRODUCE.md has {size} bytes; valid: at most {LARGEST}: results go to RESULTS.md, LOG.md"
+
+
+def prose(text: str):
+    """(number, line) of a document without its tables, fenced blocks and indented blocks."""
+    fenced = False
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.lstrip().startswith("```"):
+            fenced = not fenced
+        elif not fenced and not line.startswith(("|", "    ")):
+            yield number, line
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_lines_of_prose_are_short(document):
+    """A line of prose fits an editor's window; tables and code may be wider."""
+    text = (ROOT / document).read_text(encoding="utf-8")
+    bad = [f"{document}:{n}: {len(line)} characters" for n, line in prose(text) if len(line) > LONGEST_LINE]
+    assert not bad, "\n".join(bad)
+
+
+def commands(text: str) -> list:
+    """The commands of a document that run a program of ours: between backticks, or in an indented or fenced block.
+
+    `python FILE.py …`, `python -m PACKAGE.MODULE …`; a backslash at a line's end continues it."""
+    text = re.sub(r"\\\n\s*", " ", text)
+    paragraphs = "\n".join(line for _, line in prose(text)) + "\n" + "\n\n".join(re.findall(r"^\|.*", text, re.M))
+    spans = [span for each in re.split(r"\n\s*\n", paragraphs) for span in quoted(each)]
+    fenced = re.findall(r"^```[^\n]*\n(.*?)^```", text, re.M | re.S)
+    lines = re.findall(r"^    +(\S.*)$", text, re.M) + [line for block in fenced for line in block.splitlines()]
+    out = []
+    for line in [*(" ".join(s.split()) for s in spans), *lines]:
+        for found in re.finditer(r"\bpython ((?:-m [\w.]+|[\w./]+\.py)\b[^&;|#]*)", line):
+            if not found[1].startswith(("-m pip", "-m pytest")):
+                out.append(found[1].strip())
+    return out
+
+
+@cache
+def flags_of(program: str) -> frozenset | None:
+    """Flags that a program knows, from the dataclasses and the texts of its module or package; None: no such program.
+
+    program : FILE.py, or PACKAGE or PACKAGE.MODULE after -m"""
+    if program.endswith(".py"):
+        names = [program.removesuffix(".py").replace("/", ".")]
+    elif f"{program}.__main__" in PATHS:  # a package: any of its modules may read the flag
+        names = [m for m in MODULES if m == program or m.startswith(program + ".")]
+    else:
+        names = [program]
+    if any(name not in PATHS for name in names):
+        return None
+    found = set()
+    for name in names:
+        for value in vars(importlib.import_module(name)).values():
+            if dataclasses.is_dataclass(value) and isinstance(value, type):
+                found |= {f.name.replace("_", "-") for f in dataclasses.fields(value) if "help" in f.metadata}
+        found |= set(re.findall(r"[\"']--([a-z][a-z-]+)[\"']", PATHS[name].read_text(encoding="utf-8")))
+    return frozenset(found | {"help"} | ({"joint-map", "unit", "up"} if program == "mocap" else set()))
+
+
+def wrong_command(command: str) -> str | None:
+    """Complaint about a command, or None."""
+    words = command.removeprefix("-m ").split()
+    known = flags_of(words[0])
+    if known is None:
+        return f"python {command}: there is no {words[0]}"
+    given = {w.split("=")[0].strip("[](),.:").removeprefix("--") for w in words[1:] if re.match(r"[\[(]*--[a-z]", w)}
+    unknown = sorted(g for g in given if g not in known and g.removeprefix("no-") not in known)
+    return f"python {command}: no flag {', '.join('--' + u for u in unknown)}" if unknown else None
+
+
+def test_commands_reader():
+    """The reader itself, on the spellings in use."""
+    text = (
+        "Run `python ppo.py --character jesse\n--out runs/a` or `OMP_NUM_THREADS=1 python -m extras.bench --drop`.\n\n"
+        "    python -m pip install -e . && python metrics.py --motion A \\\n        --half report    # all of it\n"
+    )
+    wanted = ["ppo.py --character jesse --out runs/a", "-m extras.bench --drop", "metrics.py --motion A --half report"]
+    assert [" ".join(c.split()) for c in commands(text)] == wanted
+    assert not any(map(wrong_command, wanted))
+    assert wrong_command("-m drop push --prior vae --no-correction") is None
+    assert "no flag --nothing" in wrong_command("metrics.py --nothing 1")
+    assert "there is no" in wrong_command("nowhere.py") and "there is no" in wrong_command("-m nowhere")
+
+
+@pytest.mark.parametrize("document", [d for d in DOCUMENTS if d != "LOG.md"])
+def test_commands_exist(document):
+    """Programs and flags; LOG.md is history, whose flags may be gone."""
+    bad = [c for c in map(wrong_command, commands((ROOT / document).read_text(encoding="utf-8"))) if c]
+    assert not bad, f"{document}:\n" + "\n".join(bad)
 
 
 # ------------------------------------------------------------------------------------ docstrings
