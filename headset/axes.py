@@ -34,6 +34,7 @@ NAMES = ("unity", "openxr", "mujoco", "unreal")  # openvr has the axes of openxr
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
 REACH = (0.25, 1.4)  # m from headset to controller, in the median.  ASSUMED; recorded: 0.45 to 0.95
 LAG = 0.1  # s between two poses of a hand that give its lever
+FARTHEST = 1e6  # in any unit: a kilometre of millimetres
 LIES = 0.01  # m of standard deviation: a controller that moves less is in nobody's hand
 HANGS = 0.1  # m, horizontally from the face to a hanging hand, either way
 WALKS = 0.4  # m/s of a headset: it is carried somewhere
@@ -75,7 +76,7 @@ def tracked(samples, devices=3) -> list[Sample]:
     out = []
     for s in samples:
         rows = np.concatenate([s.pos, s.quat], axis=1)[:devices]
-        whole = np.isfinite(rows).all() and (np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) < 0.1).all()
+        whole = (np.abs(rows) < FARTHEST).all() and (np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) < 0.1).all()
         if whole and (not out or not s.t - out[-1].t < 0.9 / SEEN):
             out.append(s)
     return out

@@ -183,8 +183,8 @@ def _neck_end(b, named, joints, above, length):
     limbs = set().union(*(above(b.names.index(n)) for n in joints.values() if n in b.names))
     free = [j for j, (side, _) in enumerate(named) if not side and j not in limbs and above(chest) < above(j)]
     neck = free[-1] if free else chest  # of the trunk's joints the last
-    if len(free) != 1 and "neck" not in named[neck][1]:
-        return None  # nothing above the arms, or joints of other names: the user must say
+    if "neck" not in named[neck][1]:  # a single joint above the arms is the head, whatever its name
+        return b.names[neck] if len(free) == 1 else None
     end, shin = np.linalg.norm(b.end_sites.get(b.names[neck], np.zeros(3))), joints.get("foot_l")
     short = shin not in b.names or end <= NECK * length[b.names.index(shin)]
     if end > 0 and (short or neck == chest):
