@@ -4,10 +4,10 @@ r"""The environment: N characters, each driven by a headset and two controllers 
 
     observe      Eqs. 2 to 4      what the actor sees: character and sensors, in the heading frame
     privileged   §3.3             what only the critic sees: the human's full pose, now and in the future
-    reward_*     Eqs. 5 to 11     one pure function a term; Table 2's weights come from characters/NAME.toml
+    distances    Eqs. 9 to 11     one a term of the reward (Eq. 8); Table 2 is in characters/NAME.toml
     ablated      §3.5.1, §4.3     the same with less reward; `headset_only` (§4.2) and `asymmetric` (§5.3): less to see
+    Uniform      §3.6             where episodes start; another object with its three methods may stand in its place
     Env          §3.6, §3.7       reset and step as Gymnasium's vector environments have them
-    as_gymnasium                  the same as a gymnasium.vector.VectorEnv, or one character as a gymnasium.Env
 
 After a physics step MuJoCo's positions, velocities and contacts still belong to the state before the last substep;
 `Env.refresh` recomputes positions and velocities at the new state.
@@ -15,23 +15,21 @@ After a physics step MuJoCo's positions, velocities and contacts still belong to
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 
-from character import TERMS, Character, geom_lowest, load
+from character import TERMS, Character, geom_lowest
 from human import heading, quat_angle
-from mocap import data
 from plumbing.cli import UserError
 from plumbing.runs import rng_from_state, rng_state
-from retarget import STAGE_VEL, Reference, body_velocity, reference, standing
+from retarget import STAGE_VEL, Reference, body_velocity, standing
 
 ROOT_LIMIT = 0.30  # m  [Reda23 §3.6]; ASSUMED in 3-D
 FORCE_LIMIT = 1.0  # N  [Reda23 App. A]
 EPISODE_STEPS = 500  # [Reda23 §3.6]
 SUBSTEPS = 4  # ASSUMED: 1/120 s physics at 30 Hz control (a prototype did not learn at 1/60 s)
-RETRY, PLACES = (3, 60), 512  # ASSUMED: steps before a failure from which it is tried again; failures remembered
 FUTURES = (1, 5, 15)  # ASSUMED: future frames shown to the critic, in control steps
 NO_FORCES = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_SENSOR)
 BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
@@ -144,27 +142,6 @@ def headset_only(ref: Reference) -> Reference:
     return replace(ref, **{name: np.ascontiguousarray(getattr(ref, name)[:, :1]) for name in names})
 
 
-def input_names(char: Character, devices=3, asymmetric=True) -> list[str]:
-    """A name for every number of the observation, in its order: q.knee_l_y, x.head.2, user.h.R0, human_pos.17, ….
-
-    What two characters, or one with and without controllers, have names for in common, one's policy knows of the other.
-    Args      as of `observation_terms`
-    Test      tests/test_env.py::test_input_names"""
-    links = [char.model.body(b).name for b in char.obs_links]
-    user = [f"{d}.{i}" for d in "hlr"[:devices] for i in "xyz"]
-    user += [f"{d}.R{i}" for d in "hlr"[:devices] for i in range(6)]
-    own = dict(
-        q=char.hinges,
-        qd=["vx", "vy", "vz", "wx", "wy", "wz", *char.hinges],
-        x=[f"{link}.{i}" for link in links for i in "xyz"],
-        R=[f"{link}.R{i}" for link in links for i in range(6)],
-        user_previous=user,
-        user=user,
-    )
-    terms = observation_terms(char, devices, asymmetric)
-    return [f"{t}.{i}" for t, n in (terms["actor"] | terms["critic"]).items() for i in own.get(t, range(n))]
-
-
 def observe(sim, ids, before, now, out) -> HeadingFrame:
     r"""The actor's observation [Reda23 Eq. 2]: o_t = [o_{t,sim}, o_{t-1,user}, o_{t,user}].
 
@@ -206,39 +183,19 @@ def weighted_distance(sim, ref, weights):
     return (np.square(d) if d.ndim == 2 else np.einsum("nli,nli->nl", d, d)) @ weights
 
 
-def reward_q(w, k, q_sim, q_kin, weights):
-    """[Reda23 Eq. 6, Table 2] joint angles (N, j) [rad].  Test: tests/test_env.py::test_reward_terms"""
-    return kernel(w, k, weighted_distance(q_sim, q_kin, weights))
-
-
-def reward_qd(w, k, qd_sim, qd_kin, weights):
-    """[Reda23 Eq. 6, Table 2] joint velocities (N, j) [rad/s].  Test: tests/test_env.py::test_reward_terms"""
-    return kernel(w, k, weighted_distance(qd_sim, qd_kin, weights))
-
-
-def reward_x(w, k, x_sim, x_kin, weights):
-    """[Reda23 Eq. 6, Table 2] link positions (N, l, 3) [m], world.  Test: tests/test_env.py::test_reward_terms"""
-    return kernel(w, k, weighted_distance(x_sim, x_kin, weights))
-
-
-def reward_xd(w, k, xd_sim, xd_kin, weights):
-    """[Reda23 Eq. 6, Table 2] link velocities (N, l, 3) [m/s], world.  Test: tests/test_env.py::test_reward_terms"""
-    return kernel(w, k, weighted_distance(xd_sim, xd_kin, weights))
-
-
-def reward_orientation(w, k, quat_sim, quat_human):
+def orientation_distance(quat_sim, quat_human):
     r"""[Reda23 §3.5.1, App. A] orientation of root and head against the HUMAN's.
 
     Equation  d = mean over root and head of ‖log(q_gt q_sim^{-1})‖, an angle
     ASSUMED   one kernel over both, their mean
     Args      quat_sim, quat_human : (N, 2, 4), world
-    Returns   (N,)
+    Returns   (N,) [rad]
     Test      tests/test_env.py::test_reward_terms
     """
-    return kernel(w, k, quat_angle(quat_human, quat_sim).mean(-1))
+    return quat_angle(quat_human, quat_sim).mean(-1)
 
 
-def reward_contact(w, k, c_sim, c_human):
+def contact_distance(c_sim, c_human):
     r"""[Reda23 §3.5.2, App. A] do the feet's contacts coincide?
 
     Equation  d = ‖c_sim − c_human‖ over the two feet's booleans: 0, 1 or √2 (ASSUMED: not squared)
@@ -246,20 +203,20 @@ def reward_contact(w, k, c_sim, c_human):
     Returns   (N,)
     Test      tests/test_env.py::test_reward_terms
     """
-    return kernel(w, k, np.sqrt(np.sum(c_sim != c_human, axis=-1)))
+    return np.sqrt(np.sum(c_sim != c_human, axis=-1))
 
 
-def reward_action_diff(w, k, a_prev, a):
+def action_diff(a_prev, a):
     r"""[Reda23 Eq. 9] d = (1/N) Σ_i (a_{t−1,i} − a_{t,i})².
 
     ASSUMED   the actions (N, u) are those that the physics gets: clipped
     Test      tests/test_env.py::test_reward_terms"""
-    return kernel(w, k, np.square(a_prev - a).mean(-1))
+    return np.square(a_prev - a).mean(-1)
 
 
-def reward_action_min(w, k, a):
+def action_min(a):
     r"""[Reda23 Eq. 10] d = (1/N) Σ_i a_{t,i}².  Test: tests/test_env.py::test_reward_terms"""
-    return kernel(w, k, np.square(a).mean(-1))
+    return np.square(a).mean(-1)
 
 
 def total_reward(terms: dict):
@@ -298,9 +255,7 @@ def ablated(char: Character, without=(), track="all") -> Character:
         char = replace(char, reward_links=np.array([char.root]), link_weights=np.ones(1))
     less = replace(char, reward=char.reward | {term: (0.0, char.reward[term][1]) for term in gone})
     if not any(less.reward[term][0] for term in TERMS):
-        raise UserError(
-            f"--without {','.join(without)}: no reward is left; valid: leave one term that weighs something"
-        )
+        raise UserError(f"--without {','.join(without)}: no reward is left; valid: leave a term that weighs something")
     return less
 
 
@@ -314,30 +269,47 @@ def fallen(fall_height):
     return fall_height <= 0.0
 
 
-def too_far(root_pos, root_target):
+def too_far(root_pos, root_target, limit=ROOT_LIMIT):
     """[Reda23 §3.6] the root is more than 0.30 m from the scaled mocap root, both (N, 3), in 3-D (ASSUMED).
 
-    Test      tests/test_env.py::test_termination"""
-    return np.linalg.norm(root_pos - root_target, axis=-1) > ROOT_LIMIT
+    Test      tests/test_env.py::test_termination, test_root_limit"""
+    return np.linalg.norm(root_pos - root_target, axis=-1) > limit
+
+
+# ------------------------------------------------------------------------------------ where episodes start
+
+
+class Uniform:
+    """Every frame that has one before it and one after it, each as likely as any other  [Reda23 §3.6].
+
+    A start needs the frame before it, of o_{t-1,user}, and one to go to.
+    frames : (f,) all of them; owner : (F,) the sequence of each frame of the reference
+    Test     tests/test_env.py::test_reset_frames
+    """
+
+    def __init__(self, ref: Reference):
+        self.ref = ref
+        self.frames = np.concatenate([np.arange(a + 1, b) for a, b in zip(ref.first, ref.last, strict=True)])
+        if not len(self.frames):
+            raise UserError(f"{', '.join(ref.names[:3])}: too short; a start needs a sequence of three frames or more")
+        self.owner = np.repeat(np.arange(len(ref.first)), ref.last - ref.first + 1)
+
+    def draw(self, rng, n):
+        """n start frames (n,), and which of them start in the default pose instead of the reference's (n,) bool."""
+        return rng.choice(self.frames, n), np.zeros(n, bool)
+
+    def count(self, rng, frames, failed, steps):
+        """m episodes have ended: at which frames (m,), whether as failures, after how many steps.  All one to it."""
+
+    def state(self) -> dict:
+        """Arrays that a resumed run needs: none."""
+        return {}
+
+    def load_state(self, arrays):
+        """Continue from what `state` returned."""
 
 
 # ------------------------------------------------------------------------------------ environment
-
-
-@dataclass(frozen=True)
-class Disturbance:
-    """What training adds so that a policy survives other users and devices; all zero (the paper) by default.
-
-    sensor_offset : standard deviation of a constant error of each device's position in an episode [m]
-    sensor_noise  : of white noise on it [m]
-    push          : largest change of the root's horizontal velocity in a push [m/s]
-    push_seconds  : mean time between pushes [s]
-    """
-
-    sensor_offset: float = 0.0
-    sensor_noise: float = 0.0
-    push: float = 0.0
-    push_seconds: float = 2.0
 
 
 class Env:
@@ -350,13 +322,15 @@ class Env:
     n         : number of environments
     threads   : physics threads, 0 = all cores; results do not depend on it
     horizon   : control steps to truncation
-    disturbance : `Disturbance`; balance, retry : `_draw`; stand : `_stand`
+    disturbance : what training adds to sensors and bodies (`extras.train.Disturbance`); nothing by default
+    starts    : where episodes start, `Uniform` by default; root_limit : of `too_far` [m]
     asymmetric : the critic's observation has more than the actor's [§5.3]
     autoreset : start anew where an episode ended; without it the caller resets, and reads the state that ended
     """
 
     ENDS = ("fall", "far", "bad", "time", "clip")  # why an episode ends: three failures, two truncations
     TERMS = TERMS  # of the reward
+    OWN = ("frame", "steps", "available", "action")  # arrays of its own that a resumed run needs
 
     def __init__(
         self,
@@ -368,17 +342,16 @@ class Env:
         horizon=EPISODE_STEPS,
         substeps=SUBSTEPS,
         autoreset=True,
-        disturbance=Disturbance(),  # noqa: B008, it is frozen
-        balance=False,
+        disturbance=None,
         asymmetric=True,
-        retry=0.0,
-        stand=0.0,
+        starts=None,
+        root_limit=ROOT_LIMIT,
     ):
         self.char, self.ref, self.n, self.horizon, self.substeps = char, ref, n, horizon, substeps
-        self.name, self.training = char.name, char.training
-        self.disturbance = disturbance
-        self.dt = 1.0 / ref.rate
-        self.autoreset = autoreset
+        self.name, self.disturbance, self.root_limit = char.name, disturbance, root_limit
+        self.starts = starts or Uniform(ref)
+        self.parts = {"starts": self.starts} | ({"disturbance": disturbance} if disturbance else {})
+        self.autoreset, self.dt = autoreset, 1.0 / ref.rate
         char.model.opt.timestep = self.dt / substeps
         self.attach(char.batch(n, threads))
         self.devices = ref.sensor_pos.shape[1]  # 1: `headset_only`
@@ -389,26 +362,12 @@ class Env:
         self.critic_size = self.obs_size + sum(self.terms["critic"].values())
         self.action_size = len(char.limits)
         self.full = np.zeros((n, self.critic_size), np.float32)  # actor's observation, then the critic's
-        self.frame = np.zeros(n, int)  # reference frame of the present state
-        self.sequence = np.zeros(n, int)
+        self.frame, self.sequence = np.zeros(n, int), np.zeros(n, int)  # of the reference, at the present state
         self.steps = np.zeros(n, int)
         self.available = np.ones(n, int)  # control steps from the start to the clip's end or the horizon
         self.action = np.zeros((n, self.action_size))
         self.contact = np.zeros((n, 2), bool)
-        # of the devices' positions: constant, previous frame's, this frame's
-        self.sensor_error = np.zeros((n, 3, 3 * self.devices))
         self.rng = np.random.default_rng(seed)
-        # a start needs a frame before it (o_{t-1,user}) and one after it
-        self.starts = np.concatenate([np.arange(a + 1, b) for a, b in zip(ref.first, ref.last, strict=True)])
-        if not len(self.starts):
-            raise UserError(f"{', '.join(ref.names[:3])}: too short; a start needs a sequence of three frames or more")
-        self.owner = np.repeat(np.arange(len(ref.first)), ref.last - ref.first + 1)
-        self.balance = balance
-        self.failed = np.full(len(ref.first), 0.5)  # `balance`: of each sequence, failures and steps lived, of late
-        self.lived = np.full(len(ref.first), float(horizon))
-        self.retry = retry
-        self.lost = np.zeros(PLACES, int)  # `retry`: frames at which episodes failed of late; 0: none yet
-        self.stand = stand
 
     def attach(self, batch):
         """Where the simulations are: state and kinematics as arrays that share their memory."""
@@ -421,16 +380,8 @@ class Env:
         self.disabled = self.batch.expand("opt.disableflags")
 
     def value_scale(self, gamma):
-        """The largest return, which makes a critic's output of order 1.
-
-        Test      tests/extras/test_gym_env.py::test_interface"""
+        """The largest return, which makes a critic's output of order 1.  Test: tests/test_env.py::test_value_scale"""
         return sum(self.char.reward[t][0] for t in TERMS) / max(1.0 - gamma, 1e-3)
-
-    def stats(self) -> dict:
-        """What else a line of progress should tell: nothing.  Test: tests/extras/test_gym_env.py::test_interface"""
-        return {}
-
-    # ---- reset
 
     def reset(self, seed: int | None = None, frames=None):
         """Start all environments, at random reference frames or at the given ones.
@@ -453,76 +404,29 @@ class Env:
 
     def _reset(self, ids, frames=None):
         """Reference-state initialisation: a random mocap frame, retargeted, position and velocity."""
-        f = self._draw(ids) if frames is None else np.asarray(frames)
-        self.frame[ids], self.sequence[ids], self.steps[ids] = f, self.owner[f], 0
-        self.available[ids] = np.minimum(self.horizon, self.ref.last[self.owner[f]] - f)
+        f, upright = self.starts.draw(self.rng, len(ids)) if frames is None else (np.asarray(frames), ())
+        self.frame[ids], self.sequence[ids], self.steps[ids] = f, self.starts.owner[f], 0
+        self.available[ids] = np.minimum(self.horizon, self.ref.last[self.sequence[ids]] - f)
         self.qpos[ids], self.qvel[ids] = self.ref.qpos[f], self.ref.qvel[f]
-        if self.stand and frames is None:
-            self._stand(ids[self.rng.random(len(ids)) < self.stand])
-        if self.disturbance.sensor_offset:
-            size = self.sensor_error[ids, 0].shape
-            self.sensor_error[ids, 0] = self.disturbance.sensor_offset * self.rng.standard_normal(size)
+        if len(upright) and upright.any():
+            self._stand(ids[upright])
+        if self.disturbance:
+            self.disturbance.begin(self, ids)
         self.action[ids], self.ctrl[ids], self.warmstart[ids] = 0.0, 0.0, 0.0
         self.refresh(ids)
 
     def _stand(self, ids):
-        """Environments ids start as a stream does (`headset.player.Player`): in the default pose under the user's
-        headset, as
+        """Environments ids start as a stream does (`headset.player.Player`): in the default pose under the headset, as
         fast as it; where the root would be too far from the human's (a user who crouches, leans), as before.
 
         Why       a user who puts the headset on, or whose character has fallen, is not in the default pose
-        Note      with `balance` a failure of such a start counts as one of the sequence that it was in
         Test      tests/test_env.py::test_standing_starts"""
         ref, f = self.ref, self.frame[ids]
         pose = standing(self.char, ref.sensor_pos[f, 0], ref.sensor_quat[f, 0])
-        near = ~too_far(pose[:, :3], ref.qpos[f, :3])
+        near = ~too_far(pose[:, :3], ref.qpos[f, :3], self.root_limit)
         ids, f = ids[near], f[near]
         self.qpos[ids], self.qvel[ids] = pose[near], 0.0
         self.qvel[ids, :2] = (ref.sensor_pos[f, 0] - ref.sensor_pos[f - 1, 0])[:, :2] / self.dt
-
-    def _draw(self, ids):
-        r"""Random start frames for the environments ids.
-
-        Equation  uniform over all frames [§3.6]; with `balance` half of the simulated time is shared out by frames and
-                  half by frames × rate of failure:  p(sequence) ∝ frames (1 + h / ⟨h⟩) / E[T],
-                  E[T] = (1 − e^{−hH}) / h, within the sequence uniform; with `retry` that share of episodes starts
-                  RETRY steps before a place where one failed of late
-        Symbols   h failures a step, of late (`_count`); ⟨h⟩ its mean over frames; H horizon; T steps of an episode
-        Why       after a while most failures are in a few sequences, and a uniform draw spends its steps on the others;
-                  within them they are at a few places, such as the first steps of a run
-        Returns   (len(ids),) frames
-        Test      tests/test_env.py::test_balanced_starts, test_retried_starts
-        """
-        f = self._balanced(len(ids)) if self.balance else self.rng.choice(self.starts, len(ids))
-        if not self.retry:
-            return f
-        place = self.lost[self.rng.integers(PLACES, size=len(ids))]
-        before = place - self.rng.integers(*RETRY, size=len(ids))
-        again = (self.rng.random(len(ids)) < self.retry) & (place > 0)
-        return np.where(again, np.maximum(before, self.ref.first[self.owner[place]] + 1), f)
-
-    def _balanced(self, n):
-        frames = self.ref.last - self.ref.first - 1  # that can be started from
-        h = np.maximum(self.failed / self.lived, 1e-6)
-        p = frames * (1.0 + h / np.average(h, weights=frames)) * h / -np.expm1(-h * self.horizon)
-        cdf = np.cumsum(p)
-        k = np.searchsorted(cdf, cdf[-1] * self.rng.random(n), side="right")
-        return self.ref.first[k] + 1 + (frames[k] * self.rng.random(n)).astype(int)
-
-    def _count(self, done, terminated):
-        """Failures and steps lived of each sequence, of the past nine tenths remain with every episode's end; and the
-        frames of the failures, each in the place of any earlier one.
-
-        Test      tests/test_env.py::test_balanced_starts, test_retried_starts"""
-        if self.retry:
-            frames = self.frame[done][terminated[done]]
-            self.lost[self.rng.integers(PLACES, size=len(frames))] = frames
-        k, sequences = self.sequence[done], len(self.failed)
-        kept = 0.9 ** np.bincount(k, minlength=sequences)
-        self.failed[:] = kept * self.failed + np.bincount(k, terminated[done], sequences)
-        self.lived[:] = kept * self.lived + np.bincount(k, self.steps[done], sequences)
-
-    # ---- step
 
     def refresh(self, ids=None):
         """Positions and velocities of all bodies at the present state, of the environments ids or of all.
@@ -551,7 +455,8 @@ class Env:
         if not np.isfinite(action).all():
             raise ValueError(f"action of environment {int(np.argmin(np.isfinite(action).all(1)))} is not finite")
         a = np.clip(action, -1.0, 1.0)  # only the physics sees clipped actions
-        self._disturb()
+        if self.disturbance:
+            self.disturbance.step(self)
         self.ctrl[:] = a
         self.batch.step(nstep=self.substeps)
         contact = self._contact()
@@ -565,12 +470,8 @@ class Env:
         if bad.any():
             terms = {name: np.where(bad, 0.0, value) for name, value in terms.items()}
         lowest = geom_lowest(self.char.model, self.char.fall_geoms, self.geom_xpos, self.geom_xmat).min(1)
-        ends = dict(
-            fall=fallen(lowest) & ~bad,
-            far=too_far(self.qpos[:, :3], self.ref.qpos[f, :3]) & ~bad,
-            bad=bad,
-        )
-        ends["far"] &= ~ends["fall"]
+        ends = {"fall": fallen(lowest) & ~bad, "bad": bad}
+        ends["far"] = too_far(self.qpos[:, :3], self.ref.qpos[f, :3], self.root_limit) & ~bad & ~ends["fall"]
         terminated = ends["fall"] | ends["far"] | ends["bad"]
         ends["clip"] = (f >= self.ref.last[self.sequence]) & ~terminated
         ends["time"] = (self.steps >= self.horizon) & ~terminated & ~ends["clip"]
@@ -584,24 +485,11 @@ class Env:
         if len(done):
             info["final_critic"] = self.full.copy()
             info["final_obs"] = info["final_critic"][:, : self.obs_size]
-            if self.balance or self.retry:
-                self._count(done, terminated)
+            self.starts.count(self.rng, f[done], terminated[done], self.steps[done])
             self._reset(done)
             self._observe(done)
         info["critic"] = self.full
         return self.full[:, : self.obs_size], reward, terminated, truncated, info
-
-    def _disturb(self):
-        """Pushes, and the next frame's sensor noise.  Test: tests/test_env.py::test_disturbance"""
-        d = self.disturbance
-        if d.push:
-            pushed = np.flatnonzero(self.rng.random(self.n) < self.dt / d.push_seconds)
-            angle, size = self.rng.uniform(0, 2 * np.pi, len(pushed)), self.rng.uniform(0, d.push, len(pushed))
-            self.qvel[pushed, 0] += size * np.cos(angle)
-            self.qvel[pushed, 1] += size * np.sin(angle)
-        if d.sensor_noise:
-            self.sensor_error[:, 1] = self.sensor_error[:, 2]
-            self.sensor_error[:, 2] = d.sensor_noise * self.rng.standard_normal(self.sensor_error[:, 2].shape)
 
     def _recover(self):
         """Environments whose state is not finite, or that MuJoCo had to reset: put back on the reference, ended as
@@ -631,42 +519,36 @@ class Env:
         """Every term of Eqs. 5 to 7 at the present state, by name; a term of weight 0 is 0.  a (N, u) clipped.
 
         Test      tests/test_env.py::test_reward_terms, test_zero_weight_adds_nothing"""
-        c, ref, f, r = self.char, self.ref, self.frame, self.char.reward
-        links, ends = c.reward_links, np.array([c.root, c.head])
-        values = dict(
-            q=lambda w, k: reward_q(w, k, self.qpos[:, 7:], ref.qpos[f, 7:], c.joint_weights),
-            qd=lambda w, k: reward_qd(w, k, self.qvel[:, 6:], ref.qvel[f, 6:], c.joint_weights),
-            x=lambda w, k: reward_x(w, k, self.xpos.take(links, axis=1), ref.link_pos[f], c.link_weights),
-            xd=lambda w, k: reward_xd(w, k, self.link_velocity(), ref.link_vel[f], c.link_weights),
-            orientation=lambda w, k: reward_orientation(w, k, self.xquat.take(ends, axis=1), ref.orientation[f]),
-            contact=lambda w, k: reward_contact(w, k, self.contact, ref.contact[f]),
-            action_diff=lambda w, k: reward_action_diff(w, k, self.action, a),
-            action_min=lambda w, k: reward_action_min(w, k, a),
+        c, ref, f = self.char, self.ref, self.frame
+        head = np.array([c.root, c.head])
+        d = dict(
+            q=weighted_distance(self.qpos[:, 7:], ref.qpos[f, 7:], c.joint_weights),
+            qd=weighted_distance(self.qvel[:, 6:], ref.qvel[f, 6:], c.joint_weights),
+            x=weighted_distance(self.xpos.take(c.reward_links, axis=1), ref.link_pos[f], c.link_weights),
+            xd=weighted_distance(self.link_velocity(), ref.link_vel[f], c.link_weights),
+            orientation=orientation_distance(self.xquat.take(head, axis=1), ref.orientation[f]),
+            contact=contact_distance(self.contact, ref.contact[f]),
+            action_diff=action_diff(self.action, a),
+            action_min=action_min(a),
         )
-        return {name: values[name](*r[name]) if r[name][0] else np.zeros(self.n) for name in TERMS}
+        return {term: kernel(*c.reward[term], d[term]) for term in TERMS}
 
     def link_velocity(self):
-        """Linear velocities of the reward links.  (N, l, 3) [m/s], world
-
-        Test      tests/test_env.py::test_kinematics_are_fresh"""
+        """Of the reward links' origins, (N, l, 3) [m/s], world.  Test: tests/test_env.py::test_kinematics_are_fresh"""
         links = self.char.reward_links
         return body_velocity(self.cvel.take(links, axis=1), self.xpos.take(links, axis=1), self.com[:, self.char.root])
-
-    # ---- observation
 
     def _observe(self, ids):
         """Fill the rows `ids` of self.full (a slice or indices)."""
         ref, f = self.ref, self.frame[ids]
-        n, every = len(f), isinstance(ids, slice)
-        out = self.full if every else np.empty((n, self.critic_size), np.float32)
-        s = self.slices
+        s, every = self.slices, isinstance(ids, slice)
+        out = self.full if every else np.empty((len(f), self.critic_size), np.float32)
         before = np.maximum(f - 1, ref.first[self.sequence[ids]])  # a sequence's first frame has none before it
         user = [(ref.sensor_pos[k], ref.sensor_rot[k]) for k in (before, f)]
         frame = observe(self, ids, *user, out)
-        if self.disturbance.sensor_offset or self.disturbance.sensor_noise:
-            constant, previous, present = np.moveaxis(self.sensor_error[ids], 1, 0)  # in the heading frame
-            out[:, s["user_previous"]][:, : 3 * self.devices] += constant + previous
-            out[:, s["user"]][:, : 3 * self.devices] += constant + present
+        if self.disturbance:
+            for name, error in zip(("user_previous", "user"), self.disturbance.errors(ids)):
+                out[:, s[name]][:, : 3 * self.devices] += error
         if self.asymmetric:
             self._observe_human(frame, ids, out)
         if not every:
@@ -684,15 +566,13 @@ class Env:
         futures = out[:, s["human_rot"].stop :].reshape(n, -1, 3)
         frame.place(ref.human_pos[ahead].reshape(futures.shape), futures)
 
-    # ---- exact resume
-
     def state(self) -> tuple[dict, dict]:
         """Arrays and JSON that `load_state` continues from bit-exactly.
 
         Test      tests/test_env.py::test_state_continues_exactly, tests/test_ppo.py::test_resume_is_exact"""
-        names = ("frame", "steps", "available", "action", "sensor_error", "failed", "lived")
-        names += ("lost",) if self.retry else ()
-        arrays = {k: getattr(self, k).copy() for k in names}
+        arrays = {k: getattr(self, k).copy() for k in self.OWN}
+        for name, part in self.parts.items():
+            arrays |= {f"{name}.{k}": v for k, v in part.state().items()}
         return {"state": self.batch.state.copy()} | arrays, {"rng": rng_state(self.rng)}
 
     def load_state(self, arrays, meta):
@@ -700,49 +580,21 @@ class Env:
 
         Raises    ValueError: another environment's state
         Test      tests/test_env.py::test_state_continues_exactly, tests/robustness/test_fuzz.py::test_run_folders"""
-        own = {"state": self.batch.state} | {k: getattr(self, k) for k in self.state()[0] if k != "state"}
-        for name, need in own.items():
+        for name, need in self.state()[0].items():
             have = arrays[name]
             if have.shape != need.shape or have.dtype.kind != need.dtype.kind or not np.isfinite(have).all():
                 raise ValueError(f"env.{name} is {have.dtype} {have.shape}, expected finite {need.dtype} {need.shape}")
-            if name not in ("state", "action", "sensor_error") and have.min(initial=0) < 0:
+            if need.dtype.kind == "i" and have.min(initial=0) < 0:
                 raise ValueError(f"env.{name} is negative")
-        for name in ("frame", "lost") if self.retry else ("frame",):
-            if arrays[name].max() >= len(self.ref):
-                raise ValueError(f"env.{name} is beyond the motions' {len(self.ref)} frames")
+        if arrays["frame"].max() >= len(self.ref):
+            raise ValueError(f"env.frame is beyond the motions' {len(self.ref)} frames")
+        for name, part in self.parts.items():
+            part.load_state({k.partition(".")[2]: v for k, v in arrays.items() if k.startswith(f"{name}.")})
         self.batch.state[:] = arrays["state"]
-        self.frame[:], self.steps[:], self.action[:] = arrays["frame"], arrays["steps"], arrays["action"]
-        self.available[:] = arrays["available"]
-        self.sensor_error[:], self.failed[:], self.lived[:] = (arrays[k] for k in ("sensor_error", "failed", "lived"))
-        if self.retry:
-            self.lost[:] = arrays["lost"]
-        self.sequence[:] = self.owner[self.frame]
+        for name in self.OWN:
+            getattr(self, name)[:] = arrays[name]
+        self.sequence[:] = self.starts.owner[self.frame]
         self.rng = rng_from_state(meta["rng"])
         self.refresh()
         self._observe(slice(None))
         return self.full[:, : self.obs_size], {"critic": self.full}
-
-
-# ------------------------------------------------------------------------------------ Gymnasium
-
-
-def as_gymnasium(char="jesse", ref: Reference | None = None, n: int | None = None, **settings):
-    """This environment with Gymnasium's interface (extra `gym`): `extras.gym_env.OneCharacter`, or
-    `extras.gym_env.Characters`.
-
-    Args      char : a Character (`solved_by("pgs")`: a fifth faster), or what `character.load` takes
-              ref : the motions, the built-in ones by default
-              n : None for one character, a gymnasium.Env; a number for as many, a gymnasium.vector.VectorEnv
-              settings : of `Env`: seed, threads, horizon, substeps, disturbance, balance, retry, stand, asymmetric
-    Raises    UserError: gymnasium is not installed, or no such character
-    Test      tests/extras/test_gym_env.py::test_check_env, test_vector_is_the_environment
-    """
-    from extras import gym_env
-
-    if not isinstance(char, Character):
-        char = load(char)
-    if ref is None:
-        ref = reference(char, data.sequences("builtin", "train"))
-    if n is None:
-        return gym_env.OneCharacter(char, ref, **settings)
-    return gym_env.Characters(char, ref, n, **settings)

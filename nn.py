@@ -294,30 +294,6 @@ class MLP:
         return h
 
 
-def widened(mlp, sizes, rng):
-    r"""The same function by a network of more units a layer.
-
-    Method    old weights in the upper left corner; a new unit's incoming weights are drawn as `MLP` draws them, its
-              outgoing weights to old units and outputs are 0, so that it is silent until it is trained
-    Source    the idea of function-preserving transformations: Chen et al. 2016, "Net2Net"
-    Args      mlp : MLP; sizes : as many as mlp.sizes, the same inputs and outputs, none smaller; rng : Generator
-    Returns   MLP of the dtype of mlp
-    Raises    ValueError: other inputs or outputs, other depth, or a smaller layer
-    Test      tests/test_nn.py::test_widened_is_the_same_function
-    """
-    old, new = mlp.sizes, tuple(int(n) for n in sizes)
-    ends = lambda s: (s[0], s[-1])  # noqa: E731
-    if len(old) != len(new) or ends(old) != ends(new) or any(b < a for a, b in zip(old, new, strict=True)):
-        raise ValueError(f"sizes are {new}, expected {len(old)} from {old[0]} to {old[-1]} and none below {old}")
-    out = MLP(new, mlp.activation, rng, dtype=mlp.theta.dtype)
-    for i in range(out.n_layers):
-        rows, columns = old[i], old[i + 1]
-        out.params[f"W{i}"][:rows, :columns] = mlp.params[f"W{i}"]
-        out.params[f"W{i}"][rows:, :columns] = 0.0
-        out.params[f"b{i}"][:columns] = mlp.params[f"b{i}"]
-    return out
-
-
 # ------------------------------------------------------------------------------------ Gaussian policy head
 
 
@@ -504,10 +480,12 @@ class Adam:
         r"""Continue from `state()`, bit for bit.
 
         Args      state : dict of arrays
-        Raises    ValueError: keys or shapes differ
+        Raises    ValueError: keys or shapes differ, or t or v is negative
         Test      tests/test_nn.py::test_adam_resume
         """
         arrays = _load_arrays("Adam", state, {"t": np.array(self.t), "m": self.m, "v": self.v})
+        if not (arrays["t"] >= 0 and np.all(arrays["v"] >= 0)):
+            raise ValueError(f"Adam state has t = {arrays['t']} and a least v of {arrays['v'].min(initial=0.0):g}")
         self.t, self.m, self.v = int(arrays["t"]), arrays["m"], arrays["v"]
 
 

@@ -6,13 +6,11 @@ r"""Human pose -> character pose  [Reda23 §3.4].
 The kinematic pose slides, floats and sinks: it is a training signal, not a result.
 
     python retarget.py --character jesse --motion PATH [--png OUT | --video OUT | --bvh OUT]
-    python retarget.py --check NAME.xml      what is missing for a character of one's own
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -157,7 +155,7 @@ def headset(char: Character) -> np.ndarray:
     return data.site_xpos[char.sensor_sites[0]].copy()
 
 
-# From a standing human's hips to the headset, in the heading frame [m]: Bandai's actor and the built-in human, rounded
+# From a standing human's hips to the headset, heading frame [m]: Bandai's actor and the built-in human, rounded
 HEADSET_AHEAD = np.array([0.14, 0.0, 0.0])
 
 
@@ -165,7 +163,7 @@ def standing(char: Character, pos, quat) -> np.ndarray:
     """The default pose under headsets, turned as they look, feet on the floor: where a stream begins.
 
     ASSUMED   the root stands where the user's hips are, HEADSET_AHEAD behind the headset, as in training (§3.4: travel
-              is not scaled), and not where the character's own headset would be under the user's: Dino's is 0.38 m ahead
+              is not scaled), not where the character's own headset would be under the user's: Dino's is 0.38 m ahead
     Args      pos (N, 3) [m], quat (N, 4) of headsets, world
     Returns   qpos (N, 7 + j)
     Test      tests/headset/test_stream.py::test_stand, tests/test_env.py::test_standing_starts
@@ -444,7 +442,6 @@ def write_bvh(path, char: Character, qpos, rate) -> None:
 class Options(character.Switches):
     """What `python retarget.py` can be told."""
 
-    check: str | None = arg(None, "name every part that a character lacks: path of its .xml or .toml")
     motion: str = arg("builtin", MOTION)
     clips: str = arg("*", "shell pattern on clip names")
     joint_map: str | None = arg(None, HELP["joint_map"])
@@ -478,29 +475,11 @@ def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360), camer
     return images
 
 
-def report(name) -> int:
-    """Print all that is wrong with a character, or else its joints and masses.  -> exit status, 1 if anything is
-
-    Test      tests/test_characters.py::test_check_command"""
-    problems = character.check(name)
-    for problem in problems:
-        print(problem)
-    if problems:
-        print(f"{len(problems)} to mend")
-        return 1
-    path = Path(name)
-    char = character.load(path.with_suffix(".toml") if path.suffix == ".xml" else name)
-    print(char.summary())
-    return 0
-
-
 def main(argv=None):
-    """Print the artefacts of every clip's kinematic pose; draw the first one.  Or check a character.
+    """Print the artefacts of every clip's kinematic pose; draw the first one.
 
-    Test      tests/test_retarget.py::test_command_line, tests/test_characters.py::test_check_command"""
+    Test      tests/test_retarget.py::test_command_line"""
     opt = cli(Options, argv, "retarget.py", __doc__)
-    if opt.check:
-        return report(opt.check)
     check_folders(opt.bvh, opt.png, opt.video, read=mocap.data.parts(opt.motion))
     char = opt.load()
     clips = load(opt.motion, clips=opt.clips, reading=Reading.of(opt))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from human import SEG, quat_conj, quat_matrix, quat_mul, quat_rotate, quat_slerp
+from mocap import gait
 
 # ------------------------------------------------------------------------------------ §4: the character
 
@@ -34,18 +35,19 @@ RADII = np.array([
 def rest_offsets(height=1.75):
     r"""Each joint relative to its parent in the standing pose, arms hanging.
 
-    ASSUMED   SMPL's mean body is not to be had here: the canonical human's proportions (`mocap.gait.Body`).  Joints
-    it lacks:
-              pelvis 0.035 H above the hips, spine1 halfway to the chest's base (spine2), spine3 0.07 H above it, neck
-              at 0.19 H, collars 0.04 H beside the middle at 0.18 H over it, foot = ball of the foot
+    ASSUMED   SMPL's mean body is not to be had here: the canonical human's proportions (`mocap.gait.Body`).
+              Joints it lacks: pelvis 0.035 H above the hips, spine1 halfway to the chest's base (spine2), spine3
+              0.07 H above it, neck at 0.19 H, collars 0.04 H beside the middle at 0.18 H over it, foot = ball of the
+              foot
     Args      height : stature [m]
     Returns   (22, 3) [m]
     Test      tests/drop/test_drop.py::test_character
     """
-    from mocap import gait
-
     b, x = gait.Body(height), np.zeros((N, 3))
-    place = lambda name, at: x.__setitem__(J[name], at)  # noqa: E731
+
+    def place(name, at):
+        x[J[name]] = at
+
     hips = np.array([0.0, 0.0, b.ankle_height + b.shin + b.thigh])
     chest = hips + b.chest
     place("pelvis", hips + [0, 0, 0.035 * height])

@@ -18,7 +18,6 @@ a trunk more than 60 degrees from the vertical, at the end or for half a second.
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -764,7 +763,6 @@ DEMOS = {
     "tilt": tilt, "stiff-knee": stiff_knee, "ragdoll": ragdoll, "wrench": wrench, "backflip": backflip,
     "weights": weights,
 }  # fmt: skip
-FIGURES = ("energies", "ablations", "failures")  # drop/figures.py
 
 
 # ------------------------------------------------------------------------------------ pictures
@@ -877,22 +875,20 @@ def check_outputs(opt):
         render._extra("imageio")
 
 
-def main(argv=None):
-    """Run one demonstration, print what it measured, draw it.  Test: tests/drop/test_drop_demos.py::test_command"""
-    argv = list(sys.argv[1:] if argv is None else argv)
-    names = [*DEMOS, "all", *FIGURES]
-    name = argv.pop(0) if argv and not argv[0].startswith("-") else None
-    if name in FIGURES:
-        from drop import figures
+def main(argv, others=()):
+    """Run one demonstration, print what it measured, draw it.
 
-        return figures.main(name, argv)
-    if name is None and (late := next((a for a in argv if a in names), None)):
+    Args      others : words that `python -m drop` knows, too, for the messages
+    Test      tests/drop/test_drop_demos.py::test_command"""
+    argv, valid = list(argv), [*DEMOS, "all", *others]
+    name = argv.pop(0) if argv and not argv[0].startswith("-") else None
+    if name is None and (late := next((a for a in argv if a in valid), None)):
         rest = " ".join(a for a in argv if a != late)
         raise UserError(f"the demonstration comes first: python -m drop {late} {rest}")
     opt = cli(Options, argv, f"python -m drop {name or 'DEMO'}", __doc__)
-    if name not in names:
+    if name not in (*DEMOS, "all"):
         raise UserError(
-            f"python -m drop needs a demonstration{f', not {name!r}' if name else ''}; valid: {', '.join(names)}"
+            f"python -m drop needs a demonstration{f', not {name!r}' if name else ''}; valid: {', '.join(valid)}"
         )
     check_outputs(opt)
     stage, takes = Stage(opt), []

@@ -365,9 +365,10 @@ def failures(opt):
 COMMANDS = {"energies": energies, "ablations": ablations, "failures": failures}
 
 
-def main(name, argv):
+def main(argv):
     """python -m drop energies|ablations|failures.  Test: tests/drop/test_drop_figures.py::test_command"""
-    opt = cli(Options, argv, f"python -m drop {name}", __doc__)
+    name, *flags = argv
+    opt = cli(Options, flags, f"python -m drop {name}", __doc__)
     takes = COMMANDS[name](opt)
     for take in takes or ():
         print(demos.report(take))

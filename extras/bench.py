@@ -44,6 +44,7 @@ from nn import LEAKY_SLOPE, Adam, gaussian_logp
 from plumbing.cli import COUNT, POSITIVE, THREADS, UserError, arg, cli, run_main
 from plumbing.files import atomic_write
 from plumbing.runs import rng_from_state, rng_state, versions
+from policy import load_policy
 from skeletal.layers import SLOPE, fk_backward, fk_forward
 from skeletal.net import Generator, rec_loss
 
@@ -84,7 +85,7 @@ class Physics:
         self.pool = rollout.Rollout(nthread=threads)
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
         probe, self.fresh = mujoco.MjData(m), np.zeros((env.n, mujoco.mj_stateSize(m, spec)))
-        for i, f in enumerate(rng.choice(env.starts, env.n)):
+        for i, f in enumerate(rng.choice(env.starts.frames, env.n)):
             probe.qpos[:], probe.qvel[:] = env.ref.qpos[f], env.ref.qvel[f]
             mujoco.mj_getState(m, probe, self.fresh[i], spec)
 
@@ -106,7 +107,7 @@ def bench(char, ref, opt: Options) -> dict:
     """
     settings = ppo.Options(envs=opt.envs, threads=opt.threads)
     env = Env(char, ref, opt.envs, threads=opt.threads)
-    trainer = ppo.Trainer(settings, *ppo.environments(char, ref, settings))
+    trainer = ppo.Trainer(settings, Env(char, ref, opt.envs, threads=opt.threads))
     trainer.start()
     env.reset()
     trainer.collect(), trainer.update()  # warm
@@ -180,7 +181,8 @@ def physics_table(char, ref, act, envs=256, seconds=1.0, seed=0, threads=0) -> l
     for substeps, solver, iterations in SETTINGS:  # a batch keeps the options that it was made with
         options.solver, options.iterations = getattr(mujoco.mjtSolver, f"mjSOL_{solver}"), iterations
         env = Env(char, ref, envs, seed, threads, substeps=substeps, autoreset=False)
-        whole = env.starts[env.starts + steps <= ref.last[env.owner[env.starts]]]  # nobody's sequence ends meanwhile
+        first = env.starts.frames
+        whole = first[first + steps <= ref.last[env.starts.owner[first]]]  # nobody's sequence ends meanwhile
         env.reset(frames=np.random.default_rng(seed).choice(whole, envs))
         runs.append((env, [], [], np.ones(envs, bool), [env.qpos.copy()]))
     for _ in range(steps):
@@ -390,14 +392,12 @@ def torch_update(trainer: ppo.Trainer):
     Args      trainer : has collected; only read, and its random state is left as it was
     Returns   function without arguments that does the update once more, from the same samples, and returns the weights
               (policy with log σ, critic) after it; the weights go on from call to call
-    Raises    ValueError: options that are not written here
+    Note      the rate is the trainer's at the first call, and no epoch is left out for the KL divergence
     Test      tests/extras/test_bench.py::test_torch_updates_as_we_do
     """
     import torch
 
-    opt, policy, rng = trainer.opt, trainer.policy, rng_from_state(rng_state(trainer.rngs[0]))
-    if opt.joint_clip or opt.value_clip or opt.standardise_minibatch or opt.schedule != "linear":
-        raise ValueError("only the paper's losses, with a linear schedule, are written in PyTorch")
+    opt, policy, rng = trainer.opt, trainer.policy, rng_from_state(rng_state(trainer.rng))
     nets = []
     for mine in (policy.actor, policy.critic):
         layers = []
@@ -411,11 +411,8 @@ def torch_update(trainer: ppo.Trainer):
     actor, critic = nets
     log_std = torch.nn.Parameter(torch.tensor(policy.log_std))
     of_policy = [*actor.parameters(), log_std]
-    left = max(1.0 - (trainer.steps - trainer.reward.size) / opt.steps, 0.0)
-    adams = [
-        torch.optim.Adam(p, lr=left * lr, eps=opt.adam_eps)
-        for p, lr in ((of_policy, opt.lr), (list(critic.parameters()), opt.value_lr))
-    ]
+    rates = (of_policy, trainer.adam_pi.lr), (list(critic.parameters()), opt.value_lr)
+    adams = [torch.optim.Adam(p, lr=lr, eps=trainer.adam_pi.eps) for p, lr in rates]
 
     def weights():
         flat = lambda net: [p.detach().numpy().T.ravel() for p in net.parameters()]  # noqa: E731
@@ -438,7 +435,7 @@ def torch_update(trainer: ppo.Trainer):
                 for each, adam, parameters in ((loss, adams[0], of_policy), (v_loss, adams[1], critic.parameters())):
                     adam.zero_grad(set_to_none=True)
                     each.backward()
-                    torch.nn.utils.clip_grad_norm_(parameters, opt.max_grad_norm)
+                    torch.nn.utils.clip_grad_norm_(parameters, ppo.MAX_GRAD_NORM)
                     adam.step()
                 with torch.no_grad():
                     log_std.clamp_(min=float(np.log(opt.min_sigma)))
@@ -470,9 +467,9 @@ def bench_peers(char, ref, opt: Options) -> dict:
         from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
     except ImportError:
         raise UserError(gym_env.NO_SB3) from None
-    # a schedule by KL divergence could leave out epochs
-    settings = ppo.Options(envs=opt.envs, threads=opt.threads, schedule="linear", steps=10**9)
-    trainer = ppo.Trainer(settings, *ppo.environments(char, ref, settings))
+    # a KL divergence beyond the target would leave out epochs
+    settings = ppo.Options(envs=opt.envs, threads=opt.threads, target_kl=1e9, steps=10**9)
+    trainer = ppo.Trainer(settings, Env(char, ref, opt.envs, threads=opt.threads))
     trainer.start()
     trainer.collect()
     by_torch = torch_update(trainer)
@@ -482,7 +479,7 @@ def bench_peers(char, ref, opt: Options) -> dict:
         return PPO(
             "MlpPolicy", VecNormalize(envs, norm_reward=False), n_steps=samples // envs.num_envs, device="cpu", seed=0,
             batch_size=settings.minibatch, n_epochs=settings.epochs, gamma=settings.gamma, gae_lambda=settings.lam,
-            clip_range=settings.clip_eps, learning_rate=settings.lr, max_grad_norm=settings.max_grad_norm,
+            clip_range=settings.clip_eps, learning_rate=settings.lr, max_grad_norm=ppo.MAX_GRAD_NORM,
             policy_kwargs={
                 "net_arch": {"pi": list(settings.hidden), "vf": list(settings.value_hidden)},
                 "activation_fn": torch.nn.LeakyReLU, "log_std_init": float(np.log(trainer.opt.sigma)),
@@ -561,7 +558,7 @@ def main(argv=None):
         char = replace(opt, character=name).load().solved_by("pgs")  # as in training
         ref = retarget.reference(char, data.sequences(opt.motion, "train", opt.clips))
         if opt.physics:
-            policy, _ = ppo.load_policy(CHARACTERS / f"{name}.npz")
+            policy, _ = load_policy(CHARACTERS / f"{name}.npz")
             act = lambda env: policy.mean_action(env.full[:, : env.obs_size])  # noqa: B023, E731
             results[name] = {"settings": physics_table(char, ref, act, opt.envs, threads=opt.threads)}
             print(f"\n{name}, {opt.envs} characters, its shipped policy, 1 s\n"

@@ -1,14 +1,14 @@
 r"""Training on an NVIDIA GPU: the same environment and learner, thousands of characters at once  (extra `gpu`).
 
-    python ppo.py --gpu --character jesse --motion FOLDER --envs 8192 --minibatch 16384
+    python -m extras.train --gpu --character jesse --motion FOLDER --envs 8192 --minibatch 16384
 
     Trainer on NumPy ──► moved ──► every array on the GPU; `np` of the modules in SWAPPED is CuPy
     MuJoCo's threads ──► Worlds ──► MuJoCo Warp, one CUDA graph for a control step
 
 Not one equation is written a second time: env.py, ppo.py and nn.py run as they stand.  The paper trained on a GPU; two
 cores do some 7,000 control steps a second.  Physics is float32 here, and solved by Newton's method instead of PGS:
-MuJoCo Warp has no PGS, and five iterations of that are as accurate.  A run ends as a run folder that `--ship`, `--init`
-and play.py read; it is continued with --init, for the random numbers of the GPU are not stored.
+MuJoCo Warp has no PGS, and five iterations of that are as accurate.  A run ends as a run folder that --init,
+extras/policies.py and play.py read; it is continued with --init, for the random numbers of the GPU are not stored.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 
+import ppo
 from plumbing.cli import UserError
+from plumbing.runs import save_checkpoint
 
-SWAPPED = ("env", "nn", "character", "human", "retarget")
+SWAPPED = ("env", "nn", "character", "human", "retarget", "policy", "ppo")  # and those of the curriculum
 NEWTON_ITERATIONS, LINE_SEARCH = 10, 15  # ASSUMED: at most; a warm start usually needs 1 to 4
 CONTACTS = 48  # most contacts of a character, an upper bound: soles have 8, a fallen body some 20
 
@@ -101,7 +103,7 @@ class Worlds:
 
 
 class Generator:
-    """What env.py and ppo.py draw, from CuPy."""
+    """What env.py, extras/train.py and ppo.py draw, from CuPy."""
 
     def __init__(self, cupy, seed):
         self.cupy, self.own = cupy, cupy.random.default_rng(seed)
@@ -125,6 +127,25 @@ class Generator:
         return self.cupy.argsort(self.own.random(n, dtype=np.float32))
 
 
+class Trainer(ppo.Trainer):
+    """`ppo.Trainer`, to be `moved`: its random numbers have their seeds already, its checkpoints are the policy alone.
+
+    Test      tests/extras/test_gpu.py::test_checkpoint_is_a_policy"""
+
+    GO_ON = "--init"
+
+    def start(self):
+        """First observation of all characters."""
+        self.env.reset()
+        if self.policy.norm.count == 0:
+            self.policy.norm.update(self.env.full)
+
+    def save(self, path, meta):
+        """The policy: --init goes on from it."""
+        own = dict(steps=self.steps, updates=self.updates, lr=self.adam_pi.lr, policy=self.policy.shape())
+        save_checkpoint(path, fetched(self.policy.arrays()), meta | own)
+
+
 def moved(trainer, device="cuda"):
     """Put a trainer's and its environment's arrays, simulations and random numbers on the GPU, in place.
 
@@ -138,9 +159,10 @@ def moved(trainer, device="cuda"):
         # one stream for both libraries, or neither would wait for the other's results
         trainer.stream = xp.cuda.ExternalStream(worlds.warp.get_stream(device).cuda_stream)
         trainer.stream.use()
-        trainer.rngs[0], env.rng = (Generator(xp, [trainer.opt.seed, k]) for k in (11, 12))
+        trainer.rng, env.rng = (Generator(xp, [trainer.opt.seed, k]) for k in (11, 12))
     policy = trainer.policy
-    single = env.char, env.ref, env  # float64 of thousands of characters would cost as much as their physics
+    # float64 of thousands of characters would cost as much as their physics
+    single = env.char, env.ref, env, *env.parts.values()
     for part in (*single, policy.norm, trainer.adam_pi, trainer.adam_v, trainer):
         for name, value in vars(part).items():
             if isinstance(value, np.ndarray):
@@ -162,8 +184,8 @@ def arrays_of(trainer):
 
     Test      tests/extras/test_gpu.py::test_swap_ends"""
     xp = trainer.env.batch.xp
-    modules = [importlib.import_module(name) for name in SWAPPED]
-    modules.append(sys.modules[type(trainer).__module__])  # ppo.py, also where it is the program
+    names = {*SWAPPED, *(type(part).__module__ for part in trainer.env.parts.values())}  # also where it is the program
+    modules = [sys.modules.get(name) or importlib.import_module(name) for name in names]
     before = [m.np for m in modules]
     for m in modules:
         m.np = xp

@@ -1,9 +1,8 @@
-r"""Gymnasium, both ways: our characters as its environments, and its tasks as what `ppo.Trainer` learns.
+r"""Gymnasium, both ways: our characters as its environments, and its tasks as what our PPO learns.
 
-    OneCharacter      one character as a gymnasium.Env                                  `env.as_gymnasium(char)`
-    Characters        N of them as a gymnasium.vector.VectorEnv                         `env.as_gymnasium(char, n=N)`
+    as_gymnasium      one character as a gymnasium.Env, or N of them as a gymnasium.vector.VectorEnv
     as_sb3            those N as a VecEnv of Stable-Baselines3, which takes no other
-    Task              a continuous task of Gymnasium's with the interface of `env.Env`  `python ppo.py --gym NAME`
+    Task              a continuous task of Gymnasium's with the interface of `env.Env`, for extras/cleanrl.py
 
 `python -m extras.gym_env --task NAME` trains Stable-Baselines3's PPO on a task, to compare.
 
@@ -20,14 +19,16 @@ import json
 import sys
 import time
 from collections import deque
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass
 from importlib import metadata
 
 import mujoco
 import numpy as np
 
-import character
+import retarget
+from character import Character, load
 from env import Env
+from mocap import data
 from nn import RunningNorm
 from plumbing.cli import NONNEGATIVE, POSITIVE, UserError, arg, cli, run_main
 from plumbing.files import atomic_write
@@ -45,17 +46,6 @@ except ImportError:
 NO_SB3 = "stable-baselines3 is not installed: python -m pip install -e '.[peers]'"
 REWARD_CLIP = 10.0  # of normalised rewards [Huang22]
 RECENT = 100  # episodes in the mean return that is printed
-CLEANRL = dict(  # [Huang22] ppo_continuous_action.py; Adam's epsilon and the clipped value are its, too
-    steps=1_000_000, envs=1, horizon=2048, minibatch=64, epochs=10, lr=3e-4, value_lr=3e-4, schedule="linear",
-    adam_eps=1e-5, gamma=0.99, lam=0.95, clip_eps=0.2, value_clip=True, joint_clip=0.5, max_grad_norm=0.5,
-    hidden=(64, 64), value_hidden=(64, 64), activation="tanh", sigma=1.0, min_sigma=1e-6, standardise_minibatch=True,
-    norm_each_step=True, reward_norm=True,
-)  # fmt: skip
-OF_CHARACTERS = (  # options that mean nothing to a task
-    *(f.name for f in fields(character.Switches)), "motion", "clips", "joint_map", "unit", "up", "balance", "retry",
-    "stand", "augment", "sensor_offset", "sensor_noise", "push", "episode", "sensors", "without", "track",
-    "solver",
-)  # fmt: skip
 
 
 def need_gymnasium():
@@ -65,6 +55,23 @@ def need_gymnasium():
 
 
 # ------------------------------------------------------------------------------------ our characters for others
+
+
+def as_gymnasium(char="jesse", ref: retarget.Reference | None = None, n: int | None = None, **settings):
+    """`env.Env` with Gymnasium's interface (extra `gym`): `OneCharacter`, or `Characters`.
+
+    Args      char : a Character (`solved_by("pgs")`: a fifth faster), or what `character.load` takes
+              ref : the motions, the built-in ones by default
+              n : None for one character, a gymnasium.Env; a number for as many, a gymnasium.vector.VectorEnv
+              settings : of `Env`: seed, threads, horizon, substeps, starts, disturbance, asymmetric, root_limit
+    Raises    UserError: gymnasium is not installed, or no such character
+    Test      tests/extras/test_gym_env.py::test_check_env, test_vector_is_the_environment
+    """
+    need_gymnasium()
+    char = char if isinstance(char, Character) else load(char)
+    if ref is None:
+        ref = retarget.reference(char, data.sequences("builtin", "train"))
+    return OneCharacter(char, ref, **settings) if n is None else Characters(char, ref, n, **settings)
 
 
 def _spaces(env: Env):
@@ -248,42 +255,23 @@ def as_sb3(characters: Characters):
 # ------------------------------------------------------------------------------------ others' tasks for us
 
 
-def with_defaults_of_cleanrl(options):
-    """ppo.Options with the defaults of CLEANRL, for `--gym`.
-
-    Test      tests/extras/test_gym_env.py::test_cleanrl_settings"""
-    changed = [
-        (f.name, f.type, field(default=CLEANRL.get(f.name, f.default), metadata=f.metadata)) for f in fields(options)
-    ]
-    return make_dataclass("GymOptions", changed, bases=(options,))
-
-
-def character_only(opt, default):
-    """UserError if options were given that mean nothing to a task.
-
-    Test      tests/extras/test_gym_env.py::test_wrong_tasks"""
-    for name in OF_CHARACTERS:
-        if getattr(opt, name) != getattr(default, name):
-            raise UserError(f"--{name.replace('_', '-')} is of characters: leave it out with --gym")
-
-
 def make(task):
     """gymnasium.make, of a task with continuous actions.
 
     Raises    UserError: gymnasium, or what the task needs, is not installed; no such task; its actions or observations
               are no numbers
-    Test      tests/extras/test_gym_env.py::test_wrong_tasks"""
+    Test      tests/extras/test_cleanrl.py::test_wrong_tasks"""
     need_gymnasium()
     try:
         made = gymnasium.make(task, disable_env_checker=True)
     except gymnasium.error.DependencyNotInstalled as e:
-        raise UserError(f"--gym {task}: {e}; python -m pip install -e '.[gym]'") from None
+        raise UserError(f"{task}: {e}; python -m pip install -e '.[gym]'") from None
     except (gymnasium.error.Error, ImportError) as e:
-        raise UserError(f"--gym {task}: {e}; valid: a task that gymnasium.make knows, as HalfCheetah-v4") from None
+        raise UserError(f"{task}: {e}; valid: a task that gymnasium.make knows, as HalfCheetah-v4") from None
     if not isinstance(made.action_space, spaces.Box) or len(made.action_space.shape) != 1:
-        raise UserError(f"--gym {task}: its actions are {made.action_space}; valid: a Box of one dimension")
+        raise UserError(f"{task}: its actions are {made.action_space}; valid: a Box of one dimension")
     if not made.observation_space.is_np_flattenable:
-        raise UserError(f"--gym {task}: its observations are {made.observation_space}; valid: what can be flattened")
+        raise UserError(f"{task}: its observations are {made.observation_space}; valid: what can be flattened")
     return made
 
 
@@ -296,10 +284,11 @@ class Task:
     Args      task : Gymnasium's name; n : copies; seed : copy i is seeded with seed + i; gamma : for reward_norm
               limit_ends : a time limit counts as a failure (CleanRL's reading), and is not bootstrapped
     Source    the normalised reward: [Huang22]
-    Test      tests/extras/test_gym_env.py::test_task_is_the_task, test_reward_normalisation, test_resume_is_exact
+    Test      tests/extras/test_gym_env.py::test_task_is_the_task, test_reward_normalisation,
+              tests/extras/test_cleanrl.py::test_resume_is_exact
     """
 
-    ENDS, TERMS, training = ("fail", "bad", "time"), (), {}
+    ENDS, TERMS = ("fail", "bad", "time"), ()
 
     def __init__(self, task, n=1, seed=0, gamma=0.99, reward_norm=False, limit_ends=False):
         self.name, self.n, self.gamma, self.limit_ends = str(task), n, gamma, limit_ends
@@ -327,7 +316,7 @@ class Task:
         return {"return_100": float(np.mean(self.recent)) if self.recent else float("nan")}
 
     def data(self) -> dict:
-        """What decides how the task behaves.  Test: tests/extras/test_gym_env.py::test_resume_is_exact"""
+        """What decides how the task behaves.  Test: tests/extras/test_cleanrl.py::test_resume_is_exact"""
         versions = {name: metadata.version(name) for name in ("gymnasium", "mujoco")}
         mark = hashlib.sha256(repr((self.name, versions)).encode()).hexdigest()[:16]
         return {"fingerprint": mark, "task": self.name, "sequences": 0, "minutes": 0.0} | versions
@@ -355,7 +344,8 @@ class Task:
 
         A reward or an observation that is not finite ends the episode as a failure.
         Raises    ValueError: an action is not finite
-        Test      tests/extras/test_gym_env.py::test_task_is_the_task, test_non_finite_task"""
+        Test      tests/extras/test_gym_env.py::test_task_is_the_task,
+                  tests/extras/test_cleanrl.py::test_non_finite_task"""
         if not np.isfinite(action).all():
             raise ValueError(f"action of copy {int(np.argmin(np.isfinite(action).all(1)))} is not finite")
         clipped = np.clip(action, self.low, self.high).astype(self.dtype)  # only the task sees clipped actions
@@ -394,7 +384,7 @@ class Task:
         """Arrays and JSON that `load_state` continues from.
 
         A task says nothing of its state, but repeats itself: each episode's random state and the actions since.
-        Test      tests/extras/test_gym_env.py::test_resume_is_exact"""
+        Test      tests/extras/test_cleanrl.py::test_resume_is_exact"""
         arrays = {k: getattr(self, k).copy() for k in ("full", "steps", "total", "discounted")}
         arrays |= {f"actions{i}": np.reshape(a, (-1, self.action_size)) for i, a in enumerate(self.actions)}
         if self.scale is not None:
@@ -407,7 +397,8 @@ class Task:
         A task that then is elsewhere does not repeat itself (it has randomness of its own): its copy begins a new
         episode, and a note says so.
         Raises    ValueError: another task's state
-        Test      tests/extras/test_gym_env.py::test_resume_is_exact, test_unrepeatable_task"""
+        Test      tests/extras/test_cleanrl.py::test_resume_is_exact,
+                  tests/extras/test_gym_env.py::test_unrepeatable_task"""
         for name in ("full", "steps", "total", "discounted"):
             have, need = arrays[name], getattr(self, name)
             if have.shape != need.shape or have.dtype.kind != need.dtype.kind or not np.isfinite(have).all():
@@ -478,7 +469,7 @@ def train_sb3(opt: Options) -> dict:
 
 def main(argv=None):
     """Train Stable-Baselines3's PPO on a task, to compare.  Test: tests/extras/test_gym_env.py::test_train_sb3"""
-    opt = cli(Options, argv, "gym_env.py", "Train Stable-Baselines3's PPO on a task, to compare `ppo.py --gym` with.")
+    opt = cli(Options, argv, "extras.gym_env", "Stable-Baselines3 on a task, to compare `extras.cleanrl` with.")
     figures = train_sb3(opt)
     print("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in figures.items()))
     if opt.json:

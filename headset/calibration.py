@@ -68,11 +68,18 @@ class Calibration:
         return Sample(sample.t, pos * self.scale, quat)
 
 
+def standing_height(pos) -> float:
+    """Height of a standing user's headset: the 87.5th percentile of its positions (T, 3) [m].
+
+    The median of its upper quarter: people stoop, nobody stretches.
+    Test      tests/headset/test_stream.py::test_calibration"""
+    return float(np.percentile(pos[:, 2], 87.5))
+
+
 def calibrate(char: Character, pos, quat, user_height: float | None = None) -> Calibration:
     r"""User's size, floor and forward direction from a second of headset poses.
 
-    Height    the 87.5th percentile of the headset's height (the median of its upper quarter: people stoop, nobody
-              stretches) is a standing user's
+    Height    `standing_height`
     Scale     `retarget.sensor_scale`, as in training
     Floor     at height 0 of the stream if that makes the user's headset 1.0 to 2.1 m high; otherwise 1.64 m below it;
               with user_height, that much below it
@@ -81,7 +88,7 @@ def calibrate(char: Character, pos, quat, user_height: float | None = None) -> C
     Args      pos (T, 3), quat (T, 4) of the headset, `to_world`'s axes
     Test      tests/headset/test_stream.py::test_calibration, test_calibration_scales_as_training
     """
-    top = float(np.percentile(pos[:, 2], 87.5))
+    top = standing_height(pos)
     estimated = user_height is not None or not STANDING[0] <= top <= STANDING[1]
     height = (user_height or AVERAGE) if estimated else top
     yaw = heading(quat)

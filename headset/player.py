@@ -28,7 +28,9 @@ import numpy as np
 from character import Character, geom_lowest
 from env import BAD, FORCE_LIMIT, SUBSTEPS, fallen, observation_terms, observe, slices_of
 from headset.calibration import Stream
-from human import heading, quat_about, quat_matrix, quat_rotate
+from headset.reader import Sample
+from human import heading, place, quat_about, quat_matrix, quat_rotate, sensors
+from mocap.augment import begins_in_motion, lead
 from mocap.data import CONTROL_RATE
 from retarget import HEADSET_AHEAD, STAGE_VEL, standing
 
@@ -202,6 +204,29 @@ def ride(char: Character, act, streams, devices=3, threads=0) -> list[Ride]:
         Ride(qpos[i, :k], contact[i, :k], action[i, :k], anew[i, :k], player.ends[i], *errors)
         for i, (k, *errors) in enumerate(zip(lengths, player.head_error, player.hand_error))
     ]
+
+
+STANDS, SETS_OFF, CAPTURE = 1.5, 1.5, 20.0  # s of a streamed capture: still, speeding up, of itself at most
+
+
+def stream_of(char: Character, clip, devices=3):
+    r"""What a headset's recording of a clip makes of it: poses at the control rate, and the human where they are.
+
+    Method    the clip with its lead-in (`mocap.augment.lead`; no speeding up where it begins still), its devices as
+              samples through `headset.calibration.Stream`, as a file's are; the calibrating second is not played
+    Returns   pos (T, 3, 3), quat (T, 3, 4) in the character's world; the clip in the same world, T frames; scale (3,)
+    Test      tests/test_metrics.py::test_streamed
+    """
+    whole = clip[: round(CAPTURE * clip.rate) + 1]
+    led = lead(whole, STANDS, SETS_OFF if begins_in_motion(whole) else 0.0)
+    stream = Stream(char, "mujoco", rate=clip.rate, devices=devices)
+    pos, quat = sensors(led)
+    ticks = []
+    for k in range(len(led)):
+        ticks += stream.push(Sample(k / clip.rate, pos[k], np.roll(quat[k], -1, axis=-1)))
+    c = stream.calibration
+    seen = place(led, -c.yaw, c.origin[:2], np.zeros(2))[len(led) - len(ticks) :]
+    return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks]), seen, c.scale
 
 
 @dataclass

@@ -17,16 +17,12 @@ readings taken here:
 - Lengths and axes are the file's own: one length unit is 1 / (`length` of `:units`) inches in CMU's files. Angles are
   radians once read, whatever the files say: `angle` of `:units` holds for the ASF, `:DEGREES` for the AMC.
 - A file gives no frame rate.
-
-    python mocap/amc.py FILE.asf [FILE.amc ...]        # prints what the files hold
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
-import sys
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -492,37 +488,3 @@ def global_pose(skeleton: Skeleton, motion):
             positions[:, j] = positions[:, parent] + world[parent].apply(rod)
         rotations[:, j] = world[j].as_quat(scalar_first=True)
     return positions, continuous(rotations)
-
-
-# ---------------------------------------------------------------- command line
-
-
-def main(argv=None) -> int:
-    """Print what an ASF and its AMC files hold; 1 if one of them is malformed."""
-    parser = argparse.ArgumentParser(prog="amc.py", description="Print what an ASF and its AMC files hold.")
-    parser.add_argument("skeleton", metavar="FILE.asf", help="the skeleton")
-    parser.add_argument("motions", nargs="*", metavar="FILE.amc", help="motions of it")
-    parser.add_argument("--bones", action="store_true", help="also list every bone: parent, direction, length, dofs")
-    args = parser.parse_args(argv)
-    failed = 0
-    try:
-        s = read_asf(args.skeleton)
-    except (AmcError, OSError) as e:
-        print(f"error: {e}", file=sys.stderr)
-        return 1
-    print(f"{s.path}: {len(s.names)} bones, {len(s.columns)} values a frame, length unit {s.length:g}")
-    for j, (name, parent) in enumerate(zip(s.names, s.parents)):
-        if args.bones:
-            above, way = s.names[parent] if parent >= 0 else "-", " ".join(f"{x:.4f}" for x in s.directions[j])
-            print(f"  {name}: parent {above}; direction {way}; length {s.lengths[j]:.4f}; {' '.join(s.dofs[j]) or '-'}")
-    for path in args.motions:
-        try:
-            print(f"{path}: {len(read_amc(path, s))} frames")
-        except (AmcError, OSError) as e:
-            failed = 1
-            print(f"error: {e}", file=sys.stderr)
-    return failed
-
-
-if __name__ == "__main__":
-    sys.exit(main())

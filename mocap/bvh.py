@@ -11,16 +11,12 @@ are the readings taken here:
 - A joint's position channels REPLACE its OFFSET, axis by axis. A few files store the root's positions relative to its
   OFFSET: read those with `root_offset="add"`. The file does not say which it is; the height of the feet does.
 - Quaternions are w, x, y, z. q and -q are one rotation; along time the sign is chosen so that q does not jump.
-
-    python mocap/bvh.py FILE.bvh        # prints what the file holds
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
-import sys
 import warnings
 from dataclasses import dataclass
 from typing import NoReturn
@@ -547,33 +543,3 @@ def _euler_degrees(q, order):
         warnings.filterwarnings("ignore", "Gimbal lock")  # the third angle is zero then, and the rotation still exact
         angles = rotation.as_euler(order, degrees=True)
     return np.unwrap(angles.reshape(T, J, 3), period=360, axis=0)
-
-
-# ---------------------------------------------------------------- command line
-
-
-def main(argv=None) -> int:
-    """Print what BVH files hold; 1 if one of them is malformed."""
-    parser = argparse.ArgumentParser(prog="bvh.py", description="Print what BVH files hold.")
-    parser.add_argument("files", nargs="+", metavar="FILE.bvh", help="files to read")
-    parser.add_argument("--joints", action="store_true", help="also list every joint: parent, offset, channels")
-    args = parser.parse_args(argv)
-    failed = 0
-    for path in args.files:
-        try:
-            bvh = read(path)
-        except (BvhError, OSError) as e:
-            failed = 1
-            print(f"error: {e}", file=sys.stderr)
-            continue
-        (T, C), hz = bvh.values.shape, 1 / bvh.frame_time
-        print(f"{path}: {len(bvh.names)} joints, {C} channels, {T} frames, {hz:.4g} Hz, {T / hz:.4g} s")
-        for name, parent, offset, listed in zip(bvh.names, bvh.parents, bvh.offsets, bvh.channels):
-            if args.joints:
-                above = bvh.names[parent] if parent >= 0 else "-"
-                print(f"  {name}: parent {above}; offset {_row(offset)}; channels {' '.join(listed) or '-'}")
-    return failed
-
-
-if __name__ == "__main__":
-    sys.exit(main())

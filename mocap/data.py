@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import re
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -26,9 +26,9 @@ import numpy as np
 from human import Clip, resample
 from mocap import bvh, gait
 from mocap.guess import _unknown
-from mocap.rigs import AS_IT_IS, RIGS, _unit, canonical, from_amc, is_amc, known_rig, read
+from mocap.rigs import AS_IT_IS, FLOORS, HELP, REST_POSES, RIGS, _unit, canonical, from_amc, is_amc, known_rig, read
 from mocap.stitch import stitch
-from plumbing.cli import UserError
+from plumbing.cli import UserError, arg
 
 CONTROL_RATE = 30.0  # Hz, ASSUMED: Table 3 is not in the text we have
 
@@ -38,16 +38,26 @@ CONTROL_RATE = 30.0  # Hz, ASSUMED: Table 3 is not in the text we have
 SPLITS = ("train", "validation", "style", "body", "all")
 
 
-def split_of(name: str) -> str:
-    """Which part of a data set a clip belongs to: by its name only, so that no run can see a held-out clip by accident.
+UNSEEN = ("07", "08", "16", "35")  # CMU's people whose bodies nothing that is shipped was trained on
 
-    body        : NAME.amc (unseen bodies)
+
+def split_of(path) -> str:
+    """Which part of a data set a clip belongs to, by its folder or its name: no run can see a held-out one by accident.
+
+    train, validation : what lies in a folder of that name, the nearest one counting
+    body        : the people of UNSEEN, by the first number of SUBJECT_TRIAL, whatever the file's format
     style       : the whole style `youthful` (unseen style)
     validation  : every clip whose trailing number ends in 5 (unseen clips; in LaFAN1 that is subject 5)
     train       : the rest
+    Args        path : of the file, from the data set's own folder on; or a clip's name
     Test        tests/mocap/test_mocap.py::test_split, tests/mocap/test_amc.py::test_body_split
     """
-    if is_amc(name):
+    path = Path(path)
+    name = path.stem if path.suffix.lower() in (".bvh", ".amc") else path.name
+    for folder in reversed(path.parts[:-1]):
+        if folder in ("train", "validation"):
+            return folder
+    if (found := re.fullmatch(r"(\d+)_\d+", name)) and found[1] in UNSEEN:
         return "body"
     if "youthful" in name:
         return "style"
@@ -59,14 +69,32 @@ BUILTIN = {"builtin": gait.MIX, "standing": gait.STANDING}  # the data sets that
 MOTION = "builtin, standing, a .bvh or .amc file, or a folder of them; or several with commas between them"
 
 
+@dataclass
+class MotionFlags:
+    """The flags of every command that reads motion: which, and what the user says of its files."""
+
+    motion: str = arg("builtin", MOTION)
+    clips: str = arg("*", "shell pattern on clip names, such as '*walk*'")
+    joint_map: str | None = arg(None, HELP["joint_map"])
+    unit: str | None = arg(None, HELP["unit"])
+    up: str | None = arg(None, HELP["up"])
+    rate: float | None = arg(None, HELP["rate"])
+    floor: str | None = arg(None, HELP["floor"], choices=FLOORS)
+    rest_pose: str | None = arg(None, HELP["rest_pose"], choices=REST_POSES)
+
+
 def builtin_clips(rate=CONTROL_RATE, seed=0, name="builtin") -> list[Clip]:
     """The procedural human of mocap/gait.py: people who walk (builtin) or stand and step (standing).
 
+    Twenty clips, two of them held out by their numbers; and ten more, of every kind and by other people, all held out.
     Test      tests/mocap/test_mocap.py::test_builtin, ::test_joined"""
-    out = []
-    library = gait.library(rate=rate, seed=seed, mix=BUILTIN[name])
-    for i, m in enumerate(library):
-        number = (i + 5) % len(library)  # so that builtin's two clips held out, 005 and 015, are straight walks
+    mix, out = BUILTIN[name], []
+    library = gait.library(rate=rate, seed=seed, mix=mix)
+    each = tuple({kind: (kind, ranges) for kind, ranges in reversed(mix)}.values())  # one of every kind
+    held_out = gait.library(minutes=5.0, rate=rate, seed=seed + 1000, mix=each)
+    numbers = [(i + 5) % len(library) for i in range(len(library))]  # so that 005 and 015 are straight walks
+    numbers += [105 + 10 * i for i in range(len(held_out))]
+    for m, number in zip(library + held_out, numbers, strict=True):
         title = f"{m['name'].split('_')[1]}_{number:03d}"
         out.append(Clip(title, f"{name}-{number:03d}", m["rate"], m["pos"], m["quat"], m["ball"]))
     return out
@@ -88,7 +116,7 @@ def parts(motion) -> list[str]:
 def licences(sets) -> list[str]:
     """Of each data set that is not built in: its name, and the first line of the licence file beside it.
 
-    Test      tests/mocap/test_mocap.py::test_licences, tests/test_ppo.py::test_ship
+    Test      tests/mocap/test_mocap.py::test_licences, tests/extras/test_policies.py::test_ship
     """
     out = []
     for path in (Path(s) for s in sets if s not in BUILTIN):
@@ -113,8 +141,8 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
               these with commas between them: each must have what is asked for
               clips : shell pattern on the names; reading : what the user says about joints, unit and axes of BVH files
               split : train | validation | style | body | all.  A folder of fewer than ten files none of whose names is
-              in the split is used whole, and says so.  .amc clips are in `body` alone, unless motion holds nothing
-              else: then it is meant, its clips are also split by their numbers, and it says so
+              in the split is used whole, and says so.  People of UNSEEN are in `body` alone, unless motion holds nobody
+              else: then they are meant, are split by their trials for train and validation, and it says so
     Raises    UserError: nothing there, a malformed file, or nothing matches; names what would have been valid
     Test      tests/mocap/test_mocap.py::test_split, ::test_load_errors, ::test_bandai_loads_in_seconds,
               tests/mocap/test_amc.py::test_body_split
@@ -132,15 +160,17 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
         files = files_of(path)
         if not files:
             raise UserError(f"{motion}: a folder without motion; valid: one that holds .bvh or .amc files")
-        meant = all(map(is_amc, files)) and split not in ("body", "all")
-        if meant:
-            print(f"{motion}: only .amc files, else held out as unseen bodies; split by their numbers", file=sys.stderr)
-        items = [(f.stem, f.name if is_amc(f) and not meant else f.stem, f) for f in files]
+        top = path if path.is_dir() else path.parent
+        keys = [Path(top.resolve().name) / f.relative_to(top) for f in files]
+        if split in ("train", "validation") and all(split_of(k) == "body" for k in keys):
+            print(f"{motion}: only people held out as unseen bodies: meant, and split by their trials", file=sys.stderr)
+            keys = [k.stem.rpartition("_")[2] for k in keys]
+        items = [(f.stem, key, f) for f, key in zip(files, keys, strict=True)]
     matching = [(name, split_of(key), item) for name, key, item in items if fnmatchcase(name, clips)]
     chosen = [item for _, part, item in matching if split in ("all", part)]
     bodies = sum(part == "body" for _, part, _ in matching)
     if split == "train" and bodies:
-        print(f"{motion}: {bodies} .amc clips left out: unseen bodies, split body", file=sys.stderr)
+        print(f"{motion}: {bodies} clips left out: unseen bodies, split body", file=sys.stderr)
     if not matching:
         names = [name for name, _, _ in items]
         more = f", … ({len(names)})" if len(names) > 6 else ""

@@ -6,9 +6,8 @@ the pelvis above them, legs by two-bone inverse kinematics, trunk, head and arms
 Feet therefore cannot skate or sink. Of the normative curves only the pitch of the foot is an input; hip, knee and
 ankle come out of the geometry and are checked against them.
 
-Canonical human (the same as in `mocap/data.py`): SI units, radians, z up, x forward, y left, quaternions w, x, y, z,
-world
-frame, floor at z = 0. Every segment frame equals the world axes when the person stands upright facing +x, arms
+Canonical human (as everywhere: `human.SEGMENTS`): SI units, radians, z up, x forward, y left, quaternions w, x, y, z,
+world frame, floor at z = 0. Every segment frame equals the world axes when the person stands upright facing +x, arms
 hanging, palms towards the thighs. Flexing the knee is a positive rotation about y; flexing hip, elbow or ankle is a
 negative one. A segment's origin is its proximal joint centre.
 
@@ -32,8 +31,6 @@ tables. ASSUMED marks what has no source.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -41,23 +38,8 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.ndimage import convolve1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
-SEGMENTS = (
-    "pelvis",
-    "chest",
-    "head",
-    "thigh_l",
-    "shin_l",
-    "foot_l",
-    "thigh_r",
-    "shin_r",
-    "foot_r",
-    "upper_arm_l",
-    "forearm_l",
-    "hand_l",
-    "upper_arm_r",
-    "forearm_r",
-    "hand_r",
-)
+from human import SEGMENTS
+
 KINDS = ("walk", "jog", "turn", "start", "stop", "stand", "sidestep", "gesture")
 GRAVITY = 9.81
 DEG = np.pi / 180.0
@@ -80,46 +62,14 @@ WALK_DUTY, JOG_DUTY = 0.58, 0.36
 # Pitch of the foot to the floor [deg], toe up +, in per cent of the stride. Walking: hip - knee + ankle of the curves
 # above, with 10..31 per cent levelled to flat (the sum stays within 4 degrees there). Jogging: the same sum of the
 # curves of [Novacheck98], thigh to the vertical.
-PITCH_WALK = np.array(
-    [
-        [0, 17],
-        [5, 5],
-        [10, 0],
-        [31, 0],
-        [40, -6],
-        [45, -12.5],
-        [50, -23],
-        [55, -41],
-        [60, -60],
-        [65, -68],
-        [70, -62],
-        [75, -49],
-        [80, -32],
-        [85, -14],
-        [90, 3],
-        [95, 14],
-        [100, 17.0],
-    ]
-)
-PITCH_JOG = np.array(
-    [
-        [0, 8],
-        [3, 3],
-        [6, 0],
-        [19, 0],
-        [25, -12],
-        [32, -38],
-        [38, -60],
-        [45, -76],
-        [55, -84],
-        [65, -74],
-        [75, -44],
-        [85, -10],
-        [92, 4],
-        [97, 8],
-        [100, 8.0],
-    ]
-)
+PITCH_WALK = np.array([
+    [0, 5, 10, 31, 40, 45, 50, 55, 60, 65, 70, 75, 80, 85, 90, 95, 100],
+    [17, 5, 0, 0, -6, -12.5, -23, -41, -60, -68, -62, -49, -32, -14, 3, 14, 17.0],
+]).T  # fmt: skip
+PITCH_JOG = np.array([
+    [0, 3, 6, 19, 25, 32, 38, 45, 55, 65, 75, 85, 92, 97, 100],
+    [8, 3, 0, 0, -12, -38, -60, -76, -84, -74, -44, -10, 4, 8, 8.0],
+]).T  # fmt: skip
 
 
 def walk_angles(phase):
@@ -267,7 +217,7 @@ class _Plan:
     """Root path, clock and rests on a fine time grid that overhangs the clip by PAD on both sides."""
 
     def __init__(self, kind, duration, rate, p, rng):
-        self.jog = kind == "jog"
+        self.jog, self.rate = kind == "jog", rate
         self.moving = abs(p.speed) > 0 or abs(p.sidestep) > 0
         self.frames = int(round(duration * rate))
         n = int(np.ceil(PAD * rate))
@@ -301,7 +251,10 @@ class _Plan:
             turn = turn + (wander - wander[inside].mean())
         self.turn = turn * gate if self.moving else np.zeros_like(t)
         dt = 1.0 / (rate * FINE)
-        integ = lambda x: np.concatenate([[0.0], np.cumsum(0.5 * (x[1:] + x[:-1])) * dt])  # noqa: E731
+
+        def integ(x):
+            return np.concatenate([[0.0], np.cumsum(0.5 * (x[1:] + x[:-1])) * dt])
+
         psi = integ(self.turn)
         self.psi = psi - psi[self.pick.start]
         c, s = np.cos(self.psi), np.sin(self.psi)
@@ -332,7 +285,10 @@ class _Plan:
             self.phase = np.full_like(t, self.delta)
             self.rests = [(self.delta, 0.0)]
             return
-        at = lambda x: np.interp(x, t, phase)  # noqa: E731
+
+        def at(x):
+            return np.interp(x, t, phase)
+
         lead = 0.0 if kind != "sidestep" or p.sidestep < 0 else 0.5  # the foot on the side of travel goes first
         if np.isinf(bouts[0][0]):
             start = 0.0 if p.variation == 0 else rng.uniform()
@@ -388,20 +344,22 @@ def _footholds(plan, p, style, side):
     for phase, when in plan.rests:
         hit = (begin <= phase + 1e-6) & (phase - 1e-6 <= begin + plan.duty)
         mid[hit], rest[hit] = when, True
-    pick = lambda x: np.interp(mid, plan.t, x)  # noqa: E731
-    psi, v, turn, u = pick(plan.psi), pick(plan.speed), pick(plan.turn), pick(plan.side)
+    psi, v, turn, u, *xy = (np.interp(mid, plan.t, x) for x in (plan.psi, plan.speed, plan.turn, plan.side, *plan.xy.T))
     half = np.where(rest, style["stand_half"], style["step_half"] + 0.25 * np.abs(u) / plan.f + 0.02 * np.abs(turn))
     lean = style["lean"] * v * turn / GRAVITY
     across = side * half - lean * 0.53 * p.height  # feet go outward in a curve, the body leans inward
     ahead = np.where(rest, 0.0, style["ahead"] * np.minimum(v / 1.3, 1.5))
-    x = pick(plan.xy[:, 0]) + ahead * np.cos(psi) - across * np.sin(psi)
-    y = pick(plan.xy[:, 1]) + ahead * np.sin(psi) + across * np.cos(psi)
+    x = xy[0] + ahead * np.cos(psi) - across * np.sin(psi)
+    y = xy[1] + ahead * np.sin(psi) + across * np.cos(psi)
     yaw = psi + side * style["toe_out"]
     i = np.clip(np.floor(own - k[0]).astype(int), 0, len(k) - 2)
     frac = own - k[i]
     s = np.clip((frac - plan.duty) / (1 - plan.duty), 0.0, 1.0)
     go = _SWING(s)
-    move = lambda z: z[i] + (z[i + 1] - z[i]) * go  # noqa: E731
+
+    def move(z):
+        return z[i] + (z[i + 1] - z[i]) * go
+
     far = np.hypot(x[i + 1] - x[i], y[i + 1] - y[i])
     # A swing foot goes around the standing one, and along the arc (its sagitta) rather than the chord of a curve.
     out = (side * style["around"] - far * (psi[i + 1] - psi[i]) / 8) * 16 * s**2 * (1 - s) ** 2
@@ -462,8 +420,9 @@ def _lowered(want, limit, rate, half=0.30):
     return want - convolve1d(over, kernel / kernel.sum(), mode="nearest")
 
 
-def _arm_base(plan, phase, gate, amount, rng, p):
+def _arm_base(plan, f, habit, rng, p):
     """Arm swing [rad]: (T, 2, 4) flexion, abduction, inward rotation, elbow; left, right [Murray67; Novacheck98]."""
+    phase, gate, amount = f.phase, f.gate, f.amount * habit
     out = np.zeros((len(phase), 2, 4))
     for j, o in enumerate((0.0, 0.5)):
         swing = -np.cos(2 * np.pi * (phase - o + 0.02))  # back at the heel strike of the same side
@@ -528,6 +487,159 @@ def _strokes(angles, t, duration, p, rng):
     return out, wrist
 
 
+@dataclass
+class _Frames:
+    """What a clip does at each of its frames, (T,) each; world frame."""
+
+    t: np.ndarray  # s
+    phase: np.ndarray  # of the stride
+    psi: np.ndarray  # heading of the path [rad]
+    v: np.ndarray  # speed along it [m/s]
+    turn: np.ndarray  # rad/s
+    gate: np.ndarray  # 1 on the move, 0 at rest
+    still: np.ndarray  # 1 - gate
+    amount: np.ndarray  # step length to the natural one
+    sway: np.ndarray  # noise of about unit variance: of the pelvis at rest,
+    look: np.ndarray  # of where the head looks,
+    nod: np.ndarray  # of its nodding
+    dip: np.ndarray  # how far the pelvis sinks in a crouch [m]
+
+
+def _frames(plan, p, rng, play):
+    """The plan at the clip's frames, and what is random in them."""
+    t, phase, gate, psi, v, turn = (
+        x[plan.pick] for x in (plan.t, plan.phase, plan.gate, plan.psi, plan.speed, plan.turn)
+    )
+    still, size = 1 - gate, p.height / 1.75
+    amount = np.clip(np.sqrt(np.maximum(v, 0) / (2.5 if plan.jog else 1.3)), 0, 1.15)  # [Sekiya98]
+    noises = [_noise(rng, t, top) * p.variation for top in (0.25, 0.22, 0.3)]
+    dip = p.crouch * size * still * np.clip(_noise(play, t, 0.35), 0.0, 1.0) if p.crouch else 0.0 * t
+    return _Frames(t, phase, psi, v, turn, gate, still, amount, *noises, dip)
+
+
+def _style(plan, p, kind, vary):
+    """How one person walks or jogs [m, rad]: varies from clip to clip."""
+    walk = {"step_half": 0.055 * vary(0.1), "lift": 2.6 * vary(0.1), "ahead": -0.10, "usual": 1.4, "around": 0.02}
+    walk["knee"] = (6 + 5 * max(p.speed - 1.2, 0.0)) * DEG
+    jog = {"step_half": 0.04 * vary(0.1), "lift": 2.1 * vary(0.1), "ahead": -0.08, "usual": 1.9, "around": 0.03}
+    jog["knee"] = 12 * DEG
+    both = {"stand_half": 0.085 * vary(0.1), "toe_out": 6 * DEG * vary(0.2), "lean": 0.6}
+    style = (jog if plan.jog else walk) | both
+    for key in ("step_half", "lift", "ahead", "usual", "stand_half", "around"):
+        style[key] *= p.height / 1.75
+    if kind == "sidestep":
+        style["step_half"] = style["stand_half"]
+    return style
+
+
+def _sway(plan, p, f):
+    """The pelvis against the path [m]: up in the middle of a stance (walking) or down (jogging), and sideways towards
+    the standing leg."""
+    size, cycle = p.height / 1.75, 2 * np.pi * (f.phase - 0.5 * plan.duty)
+    if plan.jog:
+        up = -0.85 * GRAVITY / (4 * np.pi * plan.f) ** 2 * np.cos(2 * cycle)  # nearly free fall in flight
+        side = 0.012 * size * np.cos(cycle)
+    else:
+        up = 0.5 * np.clip(0.0274 + 0.0232 * (f.v - 0.7), 0.0, 0.055) * f.gate * size * np.cos(2 * cycle + 0.4)
+        side = 0.5 * np.clip(0.0699 - 0.0349 * (f.v - 0.7), 0.03, 0.07) * f.gate * size * np.cos(cycle)  # [Orendurff04]
+    return up, side + 0.020 * p.sway * size * f.still * f.sway
+
+
+def _trunk(plan, style, f, vary):
+    """Rotations (T, 3, 3) of pelvis, chest and head, and the pelvis' turn from the path (T,)."""
+    stride, lean = np.cos(2 * np.pi * f.phase), style["lean"] * f.v * f.turn / GRAVITY
+    yaw = -4 * DEG * f.amount * stride * vary(0.15)
+    roll = 3.5 * DEG * f.amount * np.sin(2 * np.pi * (f.phase + 0.1)) - lean + 1.5 * DEG * f.still * f.sway
+    pitch = (5 if plan.jog else 1) * DEG * f.amount + 60 * DEG * f.dip
+    look = f.still * 28 * DEG * np.tanh(f.look) + np.interp(f.t + 0.35, plan.t, plan.psi) - f.psi
+    yaw_chest = 3.5 * DEG * f.amount * stride * vary(0.15) + 0.2 * look
+    pitch_chest = (9 if plan.jog else 2.5) * DEG * f.amount + 1 * DEG * f.nod * f.still + 120 * DEG * f.dip
+    nod = 2 * DEG + 6 * DEG * f.still * f.nod
+    rots = {
+        "pelvis": _rot("z", f.psi + yaw) @ _rot("y", pitch) @ _rot("x", roll),
+        "chest": _rot("z", f.psi + yaw_chest) @ _rot("y", pitch_chest) @ _rot("x", -0.3 * (roll + lean) - 1.2 * lean),
+        "head": _rot("z", f.psi + look) @ _rot("y", nod) @ _rot("x", -0.3 * lean),
+    }
+    return rots, yaw
+
+
+def _pelvis(plan, body, style, f, feet, r_pelvis, up, side):
+    """Where the pelvis is (T, 3): on the path, as high as the legs reach, lower in a crouch."""
+    c, s = np.cos(f.psi), np.sin(f.psi)
+    back = 0.3 * f.dip
+    x, y = plan.xy[plan.pick].T
+    pelvis = np.stack([x - s * side - c * back, y + c * side - s * back, 0 * f.t], 1)
+    reach = np.sqrt(body.thigh**2 + body.shin**2 + 2 * body.thigh * body.shin * np.cos(style["knee"]))
+    limits = []
+    for hip, (ankle, _, _) in zip(_hips(body, pelvis, r_pelvis), feet, strict=True):
+        flat = np.sum((hip - ankle)[:, :2] ** 2, 1)
+        limits.append(ankle[:, 2] + np.sqrt(np.maximum(reach**2 - flat, 0.2 * reach**2)) - hip[:, 2])
+    bent = 0.045 * (body.height / 1.75) if plan.jog else 0.0
+    want = body.thigh + body.shin + body.ankle_height - bent + up
+    pelvis[:, 2] += _lowered(want, np.min(limits, axis=0), plan.rate) - f.dip
+    return pelvis
+
+
+def _hips(body, pelvis, r_pelvis):
+    """The hip joints, left and right, (T, 3) each."""
+    return [pelvis + _apply(r_pelvis, np.array([0, sign * body.hip_half_width, 0])) for sign in (1, -1)]
+
+
+def _legs(body, f, feet, yaw, rots, poss):
+    """Thighs, shins and feet, between the pelvis and where the feet are; -> ball joints (T, 2, 3)."""
+    ball = np.zeros((len(f.t), 2, 3))
+    hips = _hips(body, poss["pelvis"], rots["pelvis"])
+    for j, (e, hip, (ankle, r_foot, yaw_foot)) in enumerate(zip("lr", hips, feet, strict=True)):
+        aim = 0.5 * (yaw_foot + f.psi + yaw)
+        thigh, shin = two_bone_leg(hip, ankle, np.stack([np.cos(aim), np.sin(aim), 0 * aim], 1), body.thigh, body.shin)
+        rots |= {f"thigh_{e}": thigh, f"shin_{e}": shin, f"foot_{e}": r_foot}
+        poss[f"thigh_{e}"] = hip
+        poss[f"shin_{e}"] = hip + _apply(thigh, np.array([0, 0, -body.thigh]))
+        poss[f"foot_{e}"] = poss[f"shin_{e}"] + _apply(shin, np.array([0, 0, -body.shin]))
+        ball[:, j] = poss[f"foot_{e}"] + _apply(r_foot, body.ball)
+    return ball
+
+
+def _arms(body, angles, wrist, rots, poss):
+    """Upper arms, forearms and hands by their angles; a wrist of None does not turn."""
+    for j, (e, sign) in enumerate((("l", 1), ("r", -1))):
+        flex, abd, inward, elbow = angles[:, j].T
+        upper = rots["chest"] @ _rot("y", -flex) @ _rot("x", sign * abd) @ _rot("z", -sign * inward)
+        fore = hand = upper @ _rot("y", -elbow)
+        if wrist is not None:
+            hand = fore @ _rot("y", -wrist[:, j, 0]) @ _rot("x", sign * wrist[:, j, 1])
+        rots |= {f"upper_arm_{e}": upper, f"forearm_{e}": fore, f"hand_{e}": hand}
+        poss[f"upper_arm_{e}"] = poss["chest"] + _apply(rots["chest"], body.shoulder * [1, sign, 1])
+        poss[f"forearm_{e}"] = poss[f"upper_arm_{e}"] + _apply(upper, np.array([0, 0, -body.upper_arm]))
+        poss[f"hand_{e}"] = poss[f"forearm_{e}"] + _apply(fore, np.array([0, 0, -body.forearm]))
+
+
+def _continuous(quat):
+    """(T, s, 4) without jumps between q and -q; the first has w > 0."""
+    flip = np.where(np.sum(quat[1:] * quat[:-1], -1) < 0, -1.0, 1.0)
+    first = np.where(quat[:1, :, 0] < 0, -1.0, 1.0)
+    return quat * np.cumprod(np.concatenate([first, flip]), 0)[..., None]
+
+
+def _asked_for(kind, duration, rate, params) -> GaitParams:
+    """The parameters of a clip, checked; ValueError names what is valid."""
+    if kind not in KINDS:
+        raise ValueError(f"gait kind {kind!r}: valid are {', '.join(KINDS)}")
+    valid = [f.name for f in fields(GaitParams)]
+    if unknown := sorted(set(params) - set(valid)):
+        raise ValueError(f"gait parameter {unknown[0]!r}: valid are {', '.join(valid)}")
+    p = GaitParams(**{**DEFAULTS.get(kind, {}), **params})
+    if p.gesture is not None and p.gesture not in GESTURES:
+        raise ValueError(f"gesture {p.gesture!r}: valid are {', '.join(GESTURES)}")
+    if duration * rate < 2 or p.height <= 0 or p.speed < 0:
+        raise ValueError(f"duration {duration}, rate {rate}, height {p.height}, speed {p.speed}: must be positive")
+    if not (0 <= p.strokes <= 5 and 0 <= p.sway <= 5 and 0 <= p.crouch <= 0.3):
+        raise ValueError(
+            f"strokes {p.strokes}, sway {p.sway}, crouch {p.crouch}: valid are 0 to 5 a second, 0 to 5, 0 to 0.3 m"
+        )
+    return p
+
+
 def generate(kind, duration, rate=30.0, seed=0, **params):
     r"""One clip of procedural human motion.
 
@@ -543,139 +655,34 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
     Raises    ValueError: unknown kind, parameter or gesture, or a value that makes no motion
     Test      tests/mocap/test_gait.py
     """
-    if kind not in KINDS:
-        raise ValueError(f"gait kind {kind!r}: valid are {', '.join(KINDS)}")
-    valid = [f.name for f in fields(GaitParams)]
-    if unknown := sorted(set(params) - set(valid)):
-        raise ValueError(f"gait parameter {unknown[0]!r}: valid are {', '.join(valid)}")
-    p = GaitParams(**{**DEFAULTS.get(kind, {}), **params})
-    if p.gesture is not None and p.gesture not in GESTURES:
-        raise ValueError(f"gesture {p.gesture!r}: valid are {', '.join(GESTURES)}")
-    if duration * rate < 2 or p.height <= 0 or p.speed < 0:
-        raise ValueError(f"duration {duration}, rate {rate}, height {p.height}, speed {p.speed}: must be positive")
-    if not (0 <= p.strokes <= 5 and 0 <= p.sway <= 5 and 0 <= p.crouch <= 0.3):
-        raise ValueError(
-            f"strokes {p.strokes}, sway {p.sway}, crouch {p.crouch}: valid are 0 to 5 a second, 0 to 5, 0 to 0.3 m"
-        )
+    p = _asked_for(kind, duration, rate, params)
     rng = np.random.default_rng(seed)
-    body, plan = Body(p.height), _Plan(kind, duration, rate, p, rng)
-    size = p.height / 1.75
-    vary = lambda sd: 1 + sd * p.variation * np.clip(rng.standard_normal(), -2, 2)  # noqa: E731
-    walk = {
-        "step_half": 0.055 * vary(0.1),
-        "lift": 2.6 * vary(0.1),
-        "ahead": -0.10,
-        "usual": 1.4,
-        "around": 0.02,
-        "knee": (6 + 5 * max(p.speed - 1.2, 0.0)) * DEG,
-    }
-    jog = {
-        "step_half": 0.04 * vary(0.1),
-        "lift": 2.1 * vary(0.1),
-        "ahead": -0.08,
-        "usual": 1.9,
-        "around": 0.03,
-        "knee": 12 * DEG,
-    }
-    style = {
-        **(jog if plan.jog else walk),
-        "stand_half": 0.085 * vary(0.1),
-        "toe_out": 6 * DEG * vary(0.2),
-        "lean": 0.6,
-    }
-    for key in ("step_half", "lift", "ahead", "usual", "stand_half", "around"):
-        style[key] *= size
-    if kind == "sidestep":
-        style["step_half"] = style["stand_half"]
-
-    cut = lambda x: x[plan.pick]  # noqa: E731
-    t, phase, gate, psi = cut(plan.t), cut(plan.phase), cut(plan.gate), cut(plan.psi)
-    v, turn = cut(plan.speed), cut(plan.turn)
-    forward = np.sqrt(np.maximum(v, 0) / (2.5 if plan.jog else 1.3))  # step length to the natural one [Sekiya98]
-    amount = np.clip(forward, 0, 1.15)
-    sway_noise, look, nod = (_noise(rng, t, f) * p.variation for f in (0.25, 0.22, 0.3))
-    still = 1 - gate
     play = np.random.default_rng([seed, 1])  # of strokes and crouches, so that a clip without them is what it was
-    dip = p.crouch * size * still * np.clip(_noise(play, t, 0.35), 0.0, 1.0) if p.crouch else 0.0 * t
+    body, plan = Body(p.height), _Plan(kind, duration, rate, p, rng)
 
-    # Pelvis and trunk. Sideways towards the standing leg, up in its middle (walking) or down (jogging).
-    cyc = 2 * np.pi * (phase - 0.5 * plan.duty)
-    if plan.jog:
-        up = -0.85 * GRAVITY / (4 * np.pi * plan.f) ** 2 * np.cos(2 * cyc)  # nearly free fall in flight
-        side = 0.012 * size * np.cos(cyc)
-    else:
-        up = 0.5 * np.clip(0.0274 + 0.0232 * (v - 0.7), 0.0, 0.055) * gate * size * np.cos(2 * cyc + 0.4)
-        side = 0.5 * np.clip(0.0699 - 0.0349 * (v - 0.7), 0.03, 0.07) * gate * size * np.cos(cyc)  # [Orendurff04]
-    side = side + 0.020 * p.sway * size * still * sway_noise
-    lean = style["lean"] * v * turn / GRAVITY
-    yaw_p = -4 * DEG * amount * np.cos(2 * np.pi * phase) * vary(0.15)
-    roll_p = 3.5 * DEG * amount * np.sin(2 * np.pi * (phase + 0.1)) - lean + 1.5 * DEG * still * sway_noise
-    pitch_p = (5 if plan.jog else 1) * DEG * amount + 60 * DEG * dip
-    look_yaw = still * 28 * DEG * np.tanh(look) + np.interp(t + 0.35, plan.t, plan.psi) - psi
-    yaw_c = 3.5 * DEG * amount * np.cos(2 * np.pi * phase) * vary(0.15) + 0.2 * look_yaw
-    pitch_c = (9 if plan.jog else 2.5) * DEG * amount + 1 * DEG * nod * still + 120 * DEG * dip
-    r_pelvis = _rot("z", psi + yaw_p) @ _rot("y", pitch_p) @ _rot("x", roll_p)
-    r_chest = _rot("z", psi + yaw_c) @ _rot("y", pitch_c) @ _rot("x", -0.3 * (roll_p + lean) - 1.2 * lean)
-    r_head = _rot("z", psi + look_yaw) @ _rot("y", 2 * DEG + 6 * DEG * still * nod) @ _rot("x", -0.3 * lean)
+    def vary(sd):
+        return 1 + sd * p.variation * np.clip(rng.standard_normal(), -2, 2)
 
-    # Feet, pelvis height, legs.
-    scale = amount if plan.jog else np.minimum(amount, 1.1)
-    feet = [_foot(plan, body, p, style, s, scale) for s in (1, -1)]
-    c, s = np.cos(psi), np.sin(psi)
-    back = 0.3 * dip
-    x, y = cut(plan.xy).T
-    pelvis = np.stack([x - s * side - c * back, y + c * side - s * back, 0 * t], 1)
-    hips = [pelvis + _apply(r_pelvis, np.array([0, sgn * body.hip_half_width, 0])) for sgn in (1, -1)]
-    reach = np.sqrt(body.thigh**2 + body.shin**2 + 2 * body.thigh * body.shin * np.cos(style["knee"]))
-    flat = [np.sum((h - f[0])[:, :2] ** 2, 1) for h, f in zip(hips, feet, strict=True)]
-    limit = np.min(
-        [
-            f[0][:, 2] + np.sqrt(np.maximum(reach**2 - d, 0.2 * reach**2)) - h[:, 2]
-            for h, f, d in zip(hips, feet, flat, strict=True)
-        ],
-        axis=0,
-    )
-    crouch = 0.045 * size if plan.jog else 0.0
-    height = _lowered(body.thigh + body.shin + body.ankle_height - crouch + up, limit, rate) - dip
-    pelvis[:, 2] += height
-    rots, poss = {"pelvis": r_pelvis, "chest": r_chest, "head": r_head}, {"pelvis": pelvis}
-    poss["chest"] = pelvis + _apply(r_pelvis, body.chest)
-    poss["head"] = poss["chest"] + _apply(r_chest, body.head)
-    ball = np.zeros((len(t), 2, 3))
-    for j, (e, (ankle, r_foot, yaw)) in enumerate(zip("lr", feet, strict=True)):
-        hip = hips[j] + [0, 0, 1] * height[:, None]
-        aim = 0.5 * (yaw + psi + yaw_p)
-        thigh, shin = two_bone_leg(hip, ankle, np.stack([np.cos(aim), np.sin(aim), 0 * aim], 1), body.thigh, body.shin)
-        rots |= {f"thigh_{e}": thigh, f"shin_{e}": shin, f"foot_{e}": r_foot}
-        poss[f"thigh_{e}"] = hip
-        poss[f"shin_{e}"] = hip + _apply(thigh, np.array([0, 0, -body.thigh]))
-        poss[f"foot_{e}"] = poss[f"shin_{e}"] + _apply(shin, np.array([0, 0, -body.shin]))
-        ball[:, j] = poss[f"foot_{e}"] + _apply(r_foot, body.ball)
-
-    # Arms.
-    arms = _arm_base(plan, phase, gate, amount * vary(0.15), rng, p)
+    style = _style(plan, p, kind, vary)
+    f = _frames(plan, p, rng, play)
+    up, side = _sway(plan, p, f)
+    rots, yaw = _trunk(plan, style, f, vary)
+    scale = f.amount if plan.jog else np.minimum(f.amount, 1.1)
+    feet = [_foot(plan, body, p, style, sign, scale) for sign in (1, -1)]
+    poss = {"pelvis": _pelvis(plan, body, style, f, feet, rots["pelvis"], up, side)}
+    poss["chest"] = poss["pelvis"] + _apply(rots["pelvis"], body.chest)
+    poss["head"] = poss["chest"] + _apply(rots["chest"], body.head)
+    ball = _legs(body, f, feet, yaw, rots, poss)
+    angles, wrist = _arm_base(plan, f, vary(0.15), rng, p), None
     if kind == "gesture":
-        arms = _gestures(arms, t, duration, p, rng)
-    wrist = np.zeros((len(t), 2, 2))
+        angles = _gestures(angles, f.t, duration, p, rng)
     if p.strokes:
-        arms, wrist = _strokes(arms, t, duration, p, play)
-    for j, (e, sgn) in enumerate((("l", 1), ("r", -1))):
-        flex, abd, inward, elbow = arms[:, j].T
-        upper = r_chest @ _rot("y", -flex) @ _rot("x", sgn * abd) @ _rot("z", -sgn * inward)
-        fore = upper @ _rot("y", -elbow)
-        hand = fore @ _rot("y", -wrist[:, j, 0]) @ _rot("x", sgn * wrist[:, j, 1]) if p.strokes else fore
-        rots |= {f"upper_arm_{e}": upper, f"forearm_{e}": fore, f"hand_{e}": hand}
-        poss[f"upper_arm_{e}"] = poss["chest"] + _apply(r_chest, body.shoulder * [1, sgn, 1])
-        poss[f"forearm_{e}"] = poss[f"upper_arm_{e}"] + _apply(upper, np.array([0, 0, -body.upper_arm]))
-        poss[f"hand_{e}"] = poss[f"forearm_{e}"] + _apply(fore, np.array([0, 0, -body.forearm]))
-
+        angles, wrist = _strokes(angles, f.t, duration, p, play)
+    _arms(body, angles, wrist, rots, poss)
     quat = np.stack([Rotation.from_matrix(rots[k]).as_quat(scalar_first=True) for k in SEGMENTS], 1)
-    flip = np.where(np.sum(quat[1:] * quat[:-1], -1) < 0, -1.0, 1.0)
-    first = np.where(quat[:1, :, 0] < 0, -1.0, 1.0)
-    quat *= np.cumprod(np.concatenate([first, flip]), 0)[..., None]
     return {
         "pos": np.stack([poss[k] for k in SEGMENTS], 1),
-        "quat": quat,
+        "quat": _continuous(quat),
         "ball": ball,
         "rate": float(rate),
         "name": f"{kind}_{seed}",
@@ -728,7 +735,7 @@ def library(minutes=10.0, rate=30.0, seed=0, mix=MIX):
     ASSUMED   the mix and its ranges; speeds grow with the root of the height (equal Froude number)
     Args      minutes : total length; rate [1/s]; seed : int; mix : MIX or STANDING
     Returns   list of clips as `generate` returns them; heights 1.5 to 1.9 m; strides within 6 % of the normative ones
-    Test      tests/mocap/test_gait.py::test_library_covers_everything
+    Test      tests/mocap/test_gait.py::test_library_covers_everything, ::test_motions_are_what_they_were
     """
     rng = np.random.default_rng(seed)
     count = max(1, round(minutes * 2))
@@ -777,26 +784,3 @@ def body_of(clip):
     """The Body a clip was made with."""
     shin = clip["pos"][0, SEGMENTS.index("foot_l")] - clip["pos"][0, SEGMENTS.index("shin_l")]
     return Body(float(np.linalg.norm(shin)) / 0.246)
-
-
-def main(argv=None):
-    """Print the library: length, height, speed, slide and sink of every clip."""
-    ap = argparse.ArgumentParser(description=main.__doc__)
-    ap.add_argument("--minutes", type=float, default=10.0, help="total length [min]")
-    ap.add_argument("--rate", type=float, default=30.0, help="frames per second")
-    ap.add_argument("--seed", type=int, default=0, help="the same seed gives the same bytes")
-    ap.add_argument("--standing", action="store_true", help="the mix of people who stand")
-    args = ap.parse_args(argv)
-    print(f"{'clip':<14}{'seconds':>8}{'height':>8}{'m/s':>7}{'slide m/s':>11}{'sink m':>9}")
-    for clip in library(args.minutes, args.rate, args.seed, STANDING if args.standing else MIX):
-        n = len(clip["pos"])
-        step = np.linalg.norm(np.diff(clip["pos"][:, 0, :2], axis=0), axis=1).sum() * clip["rate"] / (n - 1)
-        slide, sink = foot_report(clip)
-        print(
-            f"{clip['name']:<14}{n / clip['rate']:>8.1f}{body_of(clip).height:>8.2f}{step:>7.2f}{slide:>11.3f}"
-            f"{sink:>9.4f}"
-        )
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -64,7 +64,7 @@ def inspect(path, reading=AS_IT_IS) -> dict:
     Returns   path of each file -> `numbers`
     Test      tests/mocap/test_mocap.py::test_inspect, tests/mocap/test_mend.py::test_inspect_json"""
     path = Path(path)
-    if path.is_dir():
+    if path.is_dir() or str(path) in data.BUILTIN:
         return _inspect_folder(path, reading)
     with rigs.heard() as said:
         if is_amc(path):
@@ -84,15 +84,15 @@ def inspect(path, reading=AS_IT_IS) -> dict:
 
 def _inspect_folder(path, reading):
     """A line a file, at the rate that training takes, and what stitching makes of them."""
-    files = data.files_of(path)
+    files = [] if str(path) in data.BUILTIN else data.files_of(path)
     with rigs.heard() as said:
-        clips = data.read_clips(files, reading) if files else load(path)  # which says what a folder must hold
+        clips = data.read_clips(files, reading) if files else load(str(path))  # which says what a folder must hold
     trained = [resample(clip, CONTROL_RATE) for clip in clips]
     for clip in trained:
         print(describe(clip))
     _sequences(trained, f"{path} [all]")
-    own = {str(file): [text for name, text in said if name == str(file)] for file in files}
-    return {file: numbers(clip, own[file]) for file, clip in zip(own, clips)}
+    own = [str(file) for file in files] or [clip.name for clip in clips]
+    return {f: numbers(clip, [text for name, text in said if name == f]) for f, clip in zip(own, clips, strict=True)}
 
 
 def main(argv=None) -> None:
@@ -102,7 +102,7 @@ def main(argv=None) -> None:
     )
     sub = parser.add_subparsers(dest="command", required=True)
     p = sub.add_parser("inspect", help="print skeleton, rate, length, speed and contacts")
-    p.add_argument("path", nargs="+", help="a .bvh or .amc file, or a folder of them")
+    p.add_argument("path", nargs="+", help="a .bvh or .amc file, a folder of them, builtin or standing")
     p.add_argument("--json", metavar="OUT", help="write rate, frames, seconds, speed, hips, contact, warnings of each")
     for name, text in rigs.HELP.items():
         p.add_argument("--" + name.replace("_", "-"), help=text)

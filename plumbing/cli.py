@@ -1,4 +1,4 @@
-"""plumbing.cli."""
+"""Command lines: flags out of a dataclass, and one clear line for whatever a user gets wrong."""
 
 from __future__ import annotations
 
@@ -175,3 +175,15 @@ def _number(kind, text):
                 return int(float(text))
             raise
     return kind(text)
+
+
+def markdown(rows) -> str:
+    """Rows of text as a Markdown table, the first the heading.  Test: tests/test_metrics.py::test_table"""
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    lines.insert(1, "|---" * len(rows[0]) + "|")
+    return "\n".join(lines)
+
+
+def cell(value, fmt) -> str:
+    """A number as text: a dash for NaN, `never` for infinity.  Test: tests/test_metrics.py::test_table"""
+    return "-" if value != value else "never" if value == float("inf") else fmt.format(value)

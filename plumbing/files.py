@@ -1,14 +1,26 @@
-"""plumbing.files."""
+"""Files: written whole or not at all, and read whatever they hold: a damaged or hostile one is a UserError in one line,
+within little time and memory.
+
+Text, TOML, JSON, numbers; the XML of an MJCF before MuJoCo sees it; the arrays of an .npz.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import json
+import math
 import os
+import re
 import stat
+import struct
+import tokenize
 import tomllib
+import warnings
+import zipfile
+import zlib
 from pathlib import Path
+from xml.parsers import expat
 
 import numpy as np
 
@@ -213,3 +225,105 @@ def parse_number(word) -> float:
     if "_" in word:
         raise ValueError(f"{word[:40]!r} is no number")
     return float(word)
+
+
+# ---- MJCF ------------------------------------------------------------------------------------------------------------
+
+XML_BYTES = 2**25
+COPIES, PIXELS, ENTRIES = 1e4, 2**24, 1e6
+CLAIMS = {  # element of an MJCF -> attributes whose product may be so large
+    "replicate": ("count", COPIES),
+    "composite": ("count", COPIES),
+    "flexcomp": ("count", COPIES),
+    "texture": ("width height", PIXELS),
+    "hfield": ("nrow ncol", PIXELS),
+    "size": ("nuserdata nkey njmax nconmax", ENTRIES),
+}
+
+
+def check_claims(path, seen=()):
+    """UserError if an MJCF, or one that it includes, is no XML, or asks MuJoCo for much more than its own size.
+
+    Test      tests/robustness/test_fuzz.py::test_what_is_meant_to_hurt"""
+    copies, included, parser = [1.0], [], expat.ParserCreate()
+
+    def start(tag, attributes):
+        names, most = CLAIMS.get(tag, ("", COPIES))
+        keys = [k for k in attributes if k in names.split() or (tag == "size" and k.startswith("nuser"))]
+        words = [w for k in keys for w in attributes[k].split() if re.fullmatch(r"\d+(\.\d*)?([eE]\+?\d+)?", w)]
+        claim = math.prod(max(float(w), 1.0) for w in words)
+        copies.append(copies[-1] * (claim if most == COPIES else 1.0))
+        if max(claim / most, copies[-1] / COPIES) > 1.0:
+            where = f"{path}, line {parser.CurrentLineNumber}"
+            raise UserError(f"{where}: <{tag}> asks for {claim:g} {' x '.join(keys)}; valid: {most:g} in all")
+        if tag in ("include", "model") and "file" in attributes:
+            included.append(path.parent / attributes["file"])
+
+    def doctype(*_):
+        raise UserError(f"{path}, line {parser.CurrentLineNumber}: a document type; expected MJCF without one")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, lambda tag: copies.pop()
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        parser.Parse(read_text(path, "MJCF", XML_BYTES), True)
+    except (expat.ExpatError, ValueError) as e:
+        raise UserError(f"{path}: no XML: {e}; expected MJCF") from None
+    for other in included:
+        if other not in (path, *seen):
+            check_claims(other, (path, *seen))
+
+
+# ---- .npz ------------------------------------------------------------------------------------------------------------
+
+UNREADABLE = (
+    OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, MemoryError, zlib.error, struct.error
+)  # fmt: skip
+
+
+def read_arrays(path, expected) -> dict:
+    """The arrays of an .npz, as `runs.save_checkpoint` writes it.
+
+    Its members must be stored as they are, so that none is larger than the file: NumPy's own reader makes room for
+    whatever a header or a compressed member claims, before it looks.
+    Args      path : file; expected : what it should be, for the message
+    Raises    UserError: cut short, no .npz, object arrays, or numbers that are not there
+    Test      tests/plumbing/test_runs.py::test_damaged_checkpoints, tests/robustness/test_fuzz.py::test_policies
+    """
+    try:
+        return _members(path)
+    except zipfile.BadZipFile:
+        with open(path, "rb") as file:
+            start = file.read(2)
+        damage = "cut short or damaged" if start == b"PK" else "no .npz" if start else "empty"
+    except UNREADABLE as error:
+        damage = f"{type(error).__name__}: {error}"
+    raise UserError(f"cannot read checkpoint {path} ({damage}): {expected}")
+
+
+def _members(path):
+    arrays = {}
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        claimed, size = sum(m.file_size for m in members), os.path.getsize(path)
+        if claimed > size or any(m.compress_type != zipfile.ZIP_STORED for m in members):
+            raise ValueError(f"its members claim {claimed} bytes of a file of {size}, or are compressed")
+        for member in members:
+            name = member.filename.removesuffix(".npy")
+            if name in arrays:
+                raise ValueError(f"array {name!r} is there twice")
+            with archive.open(member) as file:
+                version = np.lib.format.read_magic(file)
+                read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+                try:
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("error")  # of headers as Python 2 wrote them
+                        shape, fortran, dtype = read_header[version](file)
+                except (KeyError, SyntaxError, tokenize.TokenError, Warning) as error:
+                    raise ValueError(f"array {name!r} has a damaged header ({error})") from None
+                data = file.read()
+            if dtype.kind not in "biufcUS" or not dtype.itemsize:
+                raise ValueError(f"array {name!r} is of {dtype}, not of numbers or text")
+            if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data):
+                raise ValueError(f"array {name!r} claims the shape {shape} of {dtype} and has {len(data)} bytes")
+            arrays[name] = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C").copy(order="K")
+    return arrays

@@ -18,27 +18,22 @@ import dataclasses
 import fnmatch
 import io
 import json
-import math
 import os
 import platform
 import signal
-import struct
 import subprocess
 import sys
 import time
-import tokenize
 import types
 import typing
-import warnings
 import zipfile
-import zlib
 from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 
 from plumbing.cli import UserError
-from plumbing.files import _twice, atomic_write, parse_json, parse_number, read_text
+from plumbing.files import _twice, atomic_write, parse_json, parse_number, read_arrays, read_text
 
 CHECKPOINT, PREVIOUS, CONFIG, METRICS = "checkpoint.npz", "checkpoint.prev.npz", "config.json", "metrics.csv"
 
@@ -205,10 +200,6 @@ def _plain(value):
 
 # ---- checkpoints ----------------------------------------------------------------------------------------------------
 
-UNREADABLE = (
-    OSError, EOFError, ValueError, KeyError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error, struct.error
-)  # fmt: skip
-
 
 def save_checkpoint(path, arrays, meta):
     """Write arrays and meta to one .npz, whole or not at all.
@@ -244,11 +235,13 @@ def load_checkpoint(path, finite=()):
     expected = f"expected an .npz file that save_checkpoint wrote (such as {CHECKPOINT} in a run folder)"
     if not Path(path).is_file():
         raise UserError(f"no checkpoint {path}: {expected}")
+    arrays = read_arrays(path, expected)
+    if "__meta__" not in arrays:
+        raise UserError(f"cannot read checkpoint {path} (no __meta__ entry): {expected}")
     try:
-        arrays = _read_arrays(path)
         meta = parse_json(arrays.pop("__meta__").tobytes())
-    except (*UNREADABLE, AttributeError, TypeError) as error:
-        raise UserError(f"cannot read checkpoint {path} ({_damage(path, error)}): {expected}") from None
+    except (ValueError, MemoryError) as error:
+        raise UserError(f"cannot read checkpoint {path} ({type(error).__name__}: {error}): {expected}") from None
     if not isinstance(meta, dict):
         raise UserError(f"cannot read checkpoint {path} (its __meta__ is no table): {expected}")
     for pattern in finite:
@@ -260,49 +253,6 @@ def load_checkpoint(path, finite=()):
             if arrays[name].dtype.kind in "fc" and not np.isfinite(arrays[name]).all():
                 raise UserError(f"checkpoint {path}: array {name!r} holds NaN or infinity; give an earlier checkpoint")
     return arrays, meta
-
-
-def _damage(path, error) -> str:
-    """What is wrong with a checkpoint, in a user's words."""
-    if isinstance(error, KeyError):
-        return "no __meta__ entry"
-    if isinstance(error, zipfile.BadZipFile):
-        with open(path, "rb") as file:
-            start = file.read(2)
-        return "cut short or damaged" if start == b"PK" else "no .npz" if start else "empty"
-    return f"{type(error).__name__}: {error}"
-
-
-def _read_arrays(path):
-    """The arrays of an .npz.  Its members must be stored as they are, so that none is larger than the file.
-
-    NumPy's own reader makes room for whatever a header or a compressed member claims, before it looks."""
-    arrays = {}
-    with zipfile.ZipFile(path) as archive:
-        members = archive.infolist()
-        claimed, size = sum(m.file_size for m in members), os.path.getsize(path)
-        if claimed > size or any(m.compress_type != zipfile.ZIP_STORED for m in members):
-            raise ValueError(f"its members claim {claimed} bytes of a file of {size}, or are compressed")
-        for member in members:
-            name = member.filename.removesuffix(".npy")
-            if name in arrays:
-                raise ValueError(f"array {name!r} is there twice")
-            with archive.open(member) as file:
-                version = np.lib.format.read_magic(file)
-                read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-                try:
-                    with warnings.catch_warnings():
-                        warnings.simplefilter("error")  # of headers as Python 2 wrote them
-                        shape, fortran, dtype = read_header[version](file)
-                except (KeyError, SyntaxError, tokenize.TokenError, Warning) as error:
-                    raise ValueError(f"array {name!r} has a damaged header ({error})") from None
-                data = file.read()
-            if dtype.kind not in "biufcUS" or not dtype.itemsize:
-                raise ValueError(f"array {name!r} is of {dtype}, not of numbers or text")
-            if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data):
-                raise ValueError(f"array {name!r} claims the shape {shape} of {dtype} and has {len(data)} bytes")
-            arrays[name] = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C").copy(order="K")
-    return arrays
 
 
 def latest_checkpoint(folder, finite=()):

@@ -21,9 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from human import (
-    PARENTS as HUMAN_PARENTS,
-)
+from human import PARENTS as HUMAN_PARENTS
 from human import (
     SEGMENTS,
     Clip,

@@ -23,6 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from plumbing.cli import UserError
 
@@ -173,8 +174,6 @@ def match_primal(a: Graph, b: Graph, at_a, at_b, names_a, names_b):
     Raises    UserError: the primal skeletons differ; shows both reductions
     Test      tests/skeletal/test_skeletal.py::test_match_primal, test_different_primals_show_both
     """
-    from scipy.optimize import linear_sum_assignment
-
     ends = [{c[0]: c[-1] for c in g.chains()} for g in (a, b)]  # first armature of a chain -> its last joint
 
     def shape(g, end, j):

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 import mocap.data
-import skeletal.data
 from mocap.data import licences
 from nn import Adam
 from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli, given_flags
@@ -41,6 +40,7 @@ from skeletal.data import (
     Structure,
     aligned,
     derive,
+    features,
     folder,
     human_motion,
     proportions,
@@ -76,7 +76,7 @@ class Domain:
         self.parents, self.names, self.feet = np.array(first.parents), first.names, first.feet
         self.ends = first.graph.leaves
         self.lengths = np.log([self._bones(c) for c in self.characters])
-        self.arrays = [(c, *skeletal.data.features(m)) for k, m0 in clips or () for c, m in ((k, m0), (k, reverse(m0)))]
+        self.arrays = [(c, *features(m)) for k, m0 in clips or () for c, m in ((k, m0), (k, reverse(m0)))]
         if arrays is not None:
             self.arrays = arrays
         self.mean, self.std = stats if stats is not None else self._statistics()

@@ -310,7 +310,8 @@ ORDER = (  # a module imports only what stands on a line above its own, or in it
     ("ppo", "headset"),
     ("play",),
     ("metrics",),
-    ("extras", "characters", "drop", "skeletal"),
+    ("characters", "drop", "skeletal"),
+    ("extras",),
 )
 BESIDE = {"drop": ("human", "mocap", "nn", "plumbing"), "skeletal": ("human", "mocap", "nn", "plumbing", "retarget")}
 RANK = {name: k for k, names in enumerate(ORDER) for name in names}

@@ -14,28 +14,23 @@ from character import TERMS
 from env import (
     FORCE_LIMIT,
     WITHOUT,
-    Disturbance,
     Env,
     HeadingFrame,
+    Uniform,
     ablated,
+    action_diff,
+    action_min,
+    contact_distance,
     fallen,
     headset_only,
-    input_names,
     kernel,
     observation_terms,
-    reward_action_diff,
-    reward_action_min,
-    reward_contact,
-    reward_orientation,
-    reward_q,
-    reward_qd,
-    reward_x,
-    reward_xd,
+    orientation_distance,
     too_far,
     total_reward,
     weighted_distance,
 )
-from human import Clip, place, resample
+from human import Clip, heading, place, resample
 from mocap import data, gait
 from plumbing.cli import UserError
 from retarget import STAGE_VEL
@@ -205,8 +200,8 @@ def test_headset_only(shared, ref, rng):
             action = 0.2 * rng.standard_normal((N, 33))
             out_a, out_b = a.step(action), b.step(action)
             np.testing.assert_array_equal(out_a[1], out_b[1])
-        names = input_names(shared, 3, asymmetric)
-        keep = [names.index(n) for n in input_names(shared, 1, asymmetric)]
+        gone = [a.slices[term].start + k for term in ("user_previous", "user") for k in (*range(3, 9), *range(15, 27))]
+        keep = np.setdiff1d(np.arange(a.full.shape[1]), gone)  # of the three positions and rotations the first
         assert b.obs_size == a.obs_size - 2 * 18 and b.full.shape[1] == a.full.shape[1] - 36 == len(keep)
         np.testing.assert_array_equal(b.full, a.full[:, keep])
         np.testing.assert_array_equal(b.full[:, : b.obs_size], a.full[:, keep[: b.obs_size]])
@@ -215,30 +210,6 @@ def test_headset_only(shared, ref, rng):
             for name in ("user_previous", "user"):  # headset's position and six numbers of its rotation
                 nine = np.concatenate([want[name][:3], want[name][9:15]])
                 np.testing.assert_allclose(b.full[i, b.slices[name]], nine, atol=2e-5)
-    noisy = Env(shared, less, 300, disturbance=Disturbance(0.05, 0.02))
-    plain = Env(shared, less, 300)
-    noisy.reset(frames=np.full(300, 9)), plain.reset(frames=np.full(300, 9))
-    noisy.step(np.zeros((300, 33))), plain.step(np.zeros((300, 33)))
-    error = (noisy.full - plain.full)[:, noisy.slices["user"]]
-    assert error[:, :3].std() == pytest.approx(np.hypot(0.05, 0.02), rel=0.15) and not error[:, 3:].any()
-
-
-def test_input_names(shared, ref):
-    """Each name where the observation has that number: looked up in MuJoCo's own arrays."""
-    env = Env(shared, ref, 2, seed=1)
-    env.reset()
-    names, m = input_names(shared), shared.model
-    assert len(names) == len(set(names)) == env.full.shape[1]
-    at = lambda name: env.full[:, names.index(name)]  # noqa: E731
-    for hinge in ("knee_l_y", "hip_r_z"):
-        k = m.joint(hinge).qposadr[0]
-        np.testing.assert_allclose(at(f"q.{hinge}"), env.qpos[:, k], rtol=1e-6)
-        np.testing.assert_allclose(at(f"qd.{hinge}"), env.qvel[:, k - 1], rtol=1e-6)
-    for body in ("head", "foot_r"):
-        np.testing.assert_allclose(at(f"x.{body}.z"), env.xpos[:, m.body(body).id, 2], rtol=1e-5)
-        np.testing.assert_allclose(at(f"R.{body}.R4"), env.xmat[:, m.body(body).id, 6], atol=1e-5)  # row 2, column 0
-    np.testing.assert_allclose(at("user.r.z"), ref.sensor_pos[env.frame, 2, 2], rtol=1e-5)
-    assert set(input_names(shared, 1)) < set(names) and "human_pos_in_15.44" in names
 
 
 def test_symmetric_critic(shared, ref, rng):
@@ -289,16 +260,12 @@ def test_reward_terms(char, ref, rng):
         d_diff = sum((q2[n, i] - q[n, i]) ** 2 for i in range(33)) / 33
         d_min = sum(q[n, i] ** 2 for i in range(33)) / 33
         for found, d in (
-            (reward_q(w, k, q, q2, weights), d_q), (reward_qd(w, k, q, q2, weights), d_q),
-            (reward_x(w, k, x, x2, wl), d_x), (reward_xd(w, k, x, x2, wl), d_x),
-            (reward_orientation(w, k, quat, quat2), d_o), (reward_orientation(w, k, -quat, quat2), d_o),
-            (reward_contact(w, k, c, c2), d_c),
-            (reward_action_diff(w, k, q2, q), d_diff), (reward_action_min(w, k, q), d_min),
+            (weighted_distance(q, q2, weights), d_q), (weighted_distance(x, x2, wl), d_x),
+            (orientation_distance(quat, quat2), d_o), (orientation_distance(-quat, quat2), d_o),
+            (contact_distance(c, c2), d_c), (action_diff(q2, q), d_diff), (action_min(q), d_min),
         ):  # fmt: skip
-            assert found.shape == (3,) and found[n] == pytest.approx(w * math.exp(-k * d), rel=1e-9)
-        assert weighted_distance(q, q2, weights)[n] == pytest.approx(d_q)
-        assert weighted_distance(x, x2, wl)[n] == pytest.approx(d_x)
-        assert kernel(w, k, np.array([d_q]))[0] == pytest.approx(w * math.exp(-k * d_q))
+            assert found.shape == (3,) and found[n] == pytest.approx(d, rel=1e-9)
+            assert kernel(w, k, found)[n] == pytest.approx(w * math.exp(-k * d), rel=1e-9)
 
     env = Env(char, ref, N, seed=5)
     env.reset()
@@ -565,6 +532,7 @@ def test_reset_frames(shared, ref):
     assert set(env.frame) <= inside and len(set(env.frame)) > 0.98 * len(inside)
     for f, s, k in zip(env.frame, env.sequence, env.available, strict=True):
         assert ref.first[s] < f < ref.last[s] and k == min(500, ref.last[s] - f)
+    assert set(env.starts.frames) == inside and type(env.starts) is Uniform
     again = env.frame.copy()
     env.reset(seed=7)
     np.testing.assert_array_equal(env.frame, again)
@@ -634,6 +602,30 @@ def test_termination(shared, ref):
     assert list(info["ends"]["time"]) == [True] * 4 + [False, False]
     assert list(info["ends"]["clip"]) == [False] * 5 + [True] and not terminated.any()
     np.testing.assert_allclose(reward, sum(info["terms"].values()), atol=1e-12)
+
+
+def test_root_limit(shared, ref):
+    """Another limit than §3.6's: as far as it, and no farther."""
+    env = Env(shared, ref, 3, root_limit=0.6)
+    env.reset(frames=[20, 20, 20])
+    env.qpos[:, 0] += [0.0, 0.5, 0.7]
+    ends = env.step(np.zeros((3, 33)))[4]["ends"]
+    assert list(ends["far"]) == [False, False, True]
+    assert list(too_far(np.array([[0.5, 0, 0], [0.7, 0, 0]]), np.zeros((2, 3)), 0.6)) == [False, True]
+
+
+def test_value_scale(shared, ref):
+    """What a character earns at most, if it never fails."""
+    most = sum(shared.reward[t][0] for t in TERMS)
+    assert Env(shared, ref, 1).value_scale(0.9) == pytest.approx(sum(most * 0.9**k for k in range(1000)))
+
+
+class Upright(Uniform):
+    """All start standing."""
+
+    def draw(self, rng, n):
+        frames, _ = super().draw(rng, n)
+        return frames, np.ones(n, bool)
 
 
 def test_step_rewards_what_was_done(char, ref, rng):
@@ -771,70 +763,6 @@ def test_bad_state_ends_alone(shared, ref, rng, field, value):
     assert not info["ends"]["bad"].any()
 
 
-# ----------------------------------------------------------------------------------------- disturbance
-
-
-def test_disturbance(shared, ref):
-    """Sensor errors reach the two user parts' positions only; pushes change the root's horizontal velocity only."""
-    n, zero = 400, np.zeros((400, 33))
-    frames = np.resize(np.arange(5, 160), n)
-
-    def pair(**kind):
-        envs_ = Env(shared, ref, n), Env(shared, ref, n, disturbance=Disturbance(**kind))
-        for e in envs_:
-            e.reset(frames=frames)
-        return envs_
-
-    def errors(plain, disturbed):
-        difference = (disturbed.full - plain.full).astype(float)
-        parts = [np.arange(plain.full.shape[1])[plain.slices[k]][:9] for k in ("user_previous", "user")]
-        np.testing.assert_array_equal(np.delete(difference, np.concatenate(parts), axis=1), 0.0)
-        return [difference[:, p] for p in parts]
-
-    plain, env = pair(sensor_offset=0.05)  # constant in an episode, in both frames
-    first, second = errors(plain, env)
-    np.testing.assert_allclose(first, second, atol=1e-6)
-    assert first.std() == pytest.approx(0.05, rel=0.1)
-    *_, terminated, truncated, _ = plain.step(zero)
-    env.step(zero)
-    same = ~(terminated | truncated)
-    difference = env.full[:, env.slices["user"]][:, :9] - plain.full[:, env.slices["user"]][:, :9]
-    np.testing.assert_allclose(difference[same], first[same], atol=1e-5)
-    env.reset(frames=frames)  # another in the next
-    assert np.abs(env.sensor_error[:, 0] - first).min(axis=1).max() > 1e-3
-
-    plain, env = pair(sensor_noise=0.02)
-    plain.step(zero), env.step(zero)
-    _, now = errors(plain, env)
-    assert now.std() == pytest.approx(0.02, rel=0.1) and abs(now.mean()) < 0.002
-    ended = plain.step(zero)[2]
-    env.step(zero)
-    before, later = errors(plain, env)
-    np.testing.assert_allclose(before[~ended], now[~ended], atol=1e-5)  # what was seen stays seen
-    assert np.abs(later - now).max() > 0.02
-
-    _, env = pair(push=0.5)
-    total, largest = 0, 0.0
-    for _ in range(60):  # two seconds: one push each on average
-        velocity = env.qvel.copy()
-        env._disturb()
-        change = env.qvel - velocity
-        assert not change[:, 2:].any()
-        size = np.hypot(change[:, 0], change[:, 1])
-        total, largest = total + np.sum(size > 0), max(largest, size.max())
-    assert total == pytest.approx(n, rel=0.2) and 0.45 < largest <= 0.5
-
-    kind = Disturbance(0.05, 0.02, 0.5)
-    env, other = Env(shared, ref, 16, disturbance=kind), Env(shared, ref, 16, seed=9, disturbance=kind)
-    env.reset(), other.reset()
-    rollout(env, 5)
-    arrays, meta = env.state()
-    want = rollout(env, 8)
-    other.load_state(arrays, meta)
-    np.testing.assert_array_equal(rollout(other, 8), want)
-    assert want[:, :, :2].any()
-
-
 # ----------------------------------------------------------------------------------------- determinism
 
 
@@ -877,54 +805,16 @@ def test_state_continues_exactly(shared, ref):
     assert want[:, :, :2].any()  # a reset was among them
 
 
-def test_balanced_starts(char):
-    """Half of the time by frames, half by failures: against simulated episodes; seeded and resumed exactly."""
-    clips = [c[:n] for c, n in zip(data.builtin_clips(), (151, 121, 211), strict=False)]
-    ref = retarget.reference(char, clips)
-    env = Env(char, ref, 6000, threads=1, horizon=100, balance=True)
-    ids, frames = np.arange(env.n), np.array([149, 119, 209])
-    counts = np.bincount(env._draw(ids), minlength=len(ref))
-    assert set(np.flatnonzero(counts)) <= set(env.starts) and counts[env.starts].min() > 0  # any start, nothing else
-    expected = env.n / len(env.starts)  # before anything has failed: by frames
-    assert abs(counts[env.starts].mean() - expected) < 1e-9 and counts.max() < 3 * expected
-    hazard = np.array([0.001, 0.05, 0.004])  # failures a step
-    env.failed[:], env.lived[:] = 7.0, 7.0 / hazard
-    starts = np.bincount(env.owner[env._draw(ids)], minlength=3)
-    rng = np.random.default_rng(0)
-    life = np.array([np.minimum(rng.geometric(h, 200_000), 100).mean() for h in hazard])  # steps of an episode
-    time = frames / frames.sum() + frames * hazard / (frames @ hazard)  # the share wanted, times two
-    np.testing.assert_allclose(starts * life / (starts @ life), time / 2, atol=0.03)
-
-    small = Env(char, ref, 8, threads=1, seed=1, balance=True)
-    small.reset(1)
-    while True:
-        before, where = (small.failed.copy(), small.lived.copy()), small.sequence.copy()
-        _, _, terminated, truncated, info = small.step(np.zeros((8, small.action_size)))
-        if terminated.any():
-            break
-    failed, lived = before
-    for i in np.flatnonzero(terminated | truncated):
-        failed[where[i]] = 0.9 * failed[where[i]] + terminated[i]
-        lived[where[i]] = 0.9 * lived[where[i]] + info["length"][i]
-    np.testing.assert_allclose(small.failed, failed)
-    np.testing.assert_allclose(small.lived, lived)
-    other = Env(char, ref, 8, threads=1, seed=5, balance=True)
-    other.load_state(*small.state())
-    for _ in range(30):
-        a = np.full((8, small.action_size), 0.1)
-        np.testing.assert_array_equal(small.step(a)[0], other.step(a)[0])
-
-
 def test_standing_starts(char):
     """Under the headset, upright, moving as it does; not where the root would then be too far from the human's."""
     ref = retarget.reference(char, [c for c in data.builtin_clips() if c.name in ("walk_005", "stand_007", "jog_009")])
-    env = Env(char, ref, 400, threads=1, stand=1.0)
+    env = Env(char, ref, 400, threads=1, starts=Upright(ref))
     env.reset(3)
     f, rest = env.frame, np.abs(env.qpos[:, 7:] - char.default).max(1) < 1e-12
-    sites = env.batch.bind("site_xpos")
     env.refresh()
-    heads = sites[:, char.sensor_sites[0]]
-    np.testing.assert_allclose(heads[rest, :2], ref.sensor_pos[f, 0, :2][rest], atol=1e-9)
+    yaw = heading(ref.sensor_quat[f, 0])
+    behind = ref.sensor_pos[f, 0, :2] - retarget.HEADSET_AHEAD[0] * np.stack([np.cos(yaw), np.sin(yaw)], 1)
+    np.testing.assert_allclose(env.qpos[rest, :2], behind[rest], atol=1e-9)  # where the user's hips are
     low = character.geom_lowest(char.model, char.sole_geoms.ravel(), env.geom_xpos, env.geom_xmat).min(1)
     assert rest.any() and np.abs(low[rest]).max() < 1e-6
     speed = np.linalg.norm((ref.sensor_pos[f, 0] - ref.sensor_pos[f - 1, 0])[:, :2], axis=1) * ref.rate
@@ -933,48 +823,10 @@ def test_standing_starts(char):
     ref.qpos[:, 2] -= 0.4  # all crouch: none can start upright
     env.reset(3)
     np.testing.assert_array_equal(env.qpos, ref.qpos[env.frame])
+    wide = Env(char, ref, 400, threads=1, starts=Upright(ref), root_limit=0.6)
+    wide.reset(3)
+    assert np.abs(wide.qpos[:, 7:] - char.default).max() < 1e-12  # unless they may be as far
     ref.qpos[:, 2] += 0.4
 
-    half = Env(char, ref, 400, threads=1, stand=0.5)
-    half.reset(3)
-    share = np.mean(np.abs(half.qpos[:, 7:] - char.default).max(1) < 1e-12)
-    assert 0.3 * rest.mean() < share < 0.7 * rest.mean()
-    half.reset(frames=np.full(400, ref.first[1] + 5))  # a frame that was asked for is taken as it is
-    assert (half.qpos == ref.qpos[ref.first[1] + 5]).all()
-
-
-def test_retried_starts(char):
-    """A share of the episodes starts 3 to 59 steps before a remembered failure, in its sequence; the rest anywhere."""
-    clips = [c[:n] for c, n in zip(data.builtin_clips(), (151, 121, 211), strict=False)]
-    ref = retarget.reference(char, clips)
-    for balance in (False, True):
-        env = Env(char, ref, 4000, threads=1, retry=0.4, balance=balance)
-        plain = np.bincount(env._draw(np.arange(env.n)), minlength=len(ref))  # nothing has failed yet
-        assert plain[env.starts].min() > 0 and plain[env.starts].max() < 4 * env.n / len(env.starts)
-        env.lost[:] = ref.first[2] + 100
-        counts = np.bincount(env._draw(np.arange(env.n)), minlength=len(ref))
-        near = np.arange(ref.first[2] + 41, ref.first[2] + 98)
-        expected = 0.4 * env.n + 0.6 * env.n * len(near) / len(env.starts)
-        assert abs(counts[near].sum() - expected) < 0.05 * env.n and counts[near].min() > 0
-        assert set(np.flatnonzero(counts)) <= set(env.starts)
-        env.lost[:] = ref.first[1] + 10  # so soon that most starts would lie in the sequence before
-        counts = np.bincount(env._draw(np.arange(env.n)), minlength=len(ref))
-        assert set(np.flatnonzero(counts)) <= set(env.starts)
-        assert counts[ref.first[1] + 1] > 0.3 * env.n
-
-    small = Env(char, ref, 64, threads=1, seed=1, retry=0.5)
-    small.reset(1)
-    fell = set()
-    for _ in range(40):
-        where = small.frame.copy()
-        _, _, terminated, _, _ = small.step(np.zeros((64, small.action_size)))
-        fell |= set(where[terminated] + 1)
-    assert len(fell) > 20 and set(small.lost[small.lost > 0]) <= fell and np.sum(small.lost > 0) > 20
-    other = Env(char, ref, 64, threads=1, seed=5, retry=0.5)
-    other.load_state(*small.state())
-    for _ in range(30):
-        a = np.full((64, small.action_size), 0.1)
-        np.testing.assert_array_equal(small.step(a)[0], other.step(a)[0])
-    arrays, meta = small.state()
-    with pytest.raises(ValueError, match="env.lost is beyond"):
-        other.load_state(arrays | {"lost": arrays["lost"] + len(ref)}, meta)
+    env.reset(frames=np.full(400, ref.first[1] + 5))  # a frame that was asked for is taken as it is
+    assert (env.qpos == ref.qpos[ref.first[1] + 5]).all()

@@ -10,10 +10,9 @@ from test_mocap import walk
 
 import character
 import metrics
-import play
 import retarget
 from env import too_far
-from human import quat_about, quat_mul
+from human import heading, quat_about, quat_mul
 from metrics import Recording
 from mocap.data import load
 from plumbing.cli import UserError
@@ -22,8 +21,10 @@ from retarget import forward_kinematics
 KEYS = (  # spec: every key of every row
     "clips completed survival root_cm head_cm hands_cm joint_pos_cm head_deg joint_rot_deg sip_deg foot_slide_cm_s "
     "penetration_mm contact_agreement jitter_m_s3 human_jitter_m_s3 steps_per_m human_steps_per_m head_wobble_deg_s "
-    "torque_rms saturation"
+    "torque_rms saturation own_slide_cm_s self_penetration_mm self_penetration_share spring_share"
 ).split()
+GROUPS = [f"spring_share.{g}" for g in ("ankle", "elbow", "head", "hip", "knee", "neck", "shoulder", "spine")]
+KEYS += GROUPS
 
 
 pytestmark = pytest.mark.usefixtures("motions_once")
@@ -67,14 +68,45 @@ def matrix(q):
     return out.reshape(3, 3)
 
 
+def resting_pairs(char):
+    """Pairs of shapes that do not count: of one body, of bodies at most two joints apart, or overlapping at rest."""
+    m, data, out = char.model, mujoco.MjData(char.model), set()
+    data.qpos[2], data.qpos[7:] = char.hip_height, char.default
+    mujoco.mj_forward(m, data)
+    geoms = [g for g in range(m.ngeom) if m.geom_conaffinity[g] and m.geom_bodyid[g]]
+
+    def way(body):
+        path = [body]
+        while path[-1]:
+            path.append(m.body_parentid[path[-1]])
+        return path[:-1]  # up to the root, without the world
+
+    for a in geoms:
+        for b in geoms:
+            one, two = way(m.geom_bodyid[a]), way(m.geom_bodyid[b])
+            shared = len(set(one) & set(two))
+            apart = len(one) + len(two) - 2 * shared
+            if apart <= 2 or mujoco.mj_geomDistance(m, data, a, b, 1.0, None) <= 0:
+                out.add((a, b))
+    return out
+
+
+def own_depth(m, data, never):
+    """Deepest overlap of any other pair in a pose [m]."""
+    geoms = [g for g in range(m.ngeom) if m.geom_conaffinity[g] and m.geom_bodyid[g]]
+    pairs = [(a, b) for a in geoms for b in geoms if a < b and (a, b) not in never]
+    return max(0.0, *(-mujoco.mj_geomDistance(m, data, a, b, 1.0, None) for a, b in pairs))
+
+
 def test_metrics_against_slow_loop(char, ref):
     """Every key, one frame and one body at a time, through mj_forward and rotation matrices."""
-    recordings = play.simulate(char, ref, play.pd_action, threads=1)
+    recordings = metrics.simulate(char, ref, metrics.pd_action, threads=1)
     rng = np.random.default_rng(0)
     for r in recordings:  # noise, so that no metric is near its ideal
         r.qpos[1:, 7:] += 0.05 * rng.standard_normal(r.qpos[1:, 7:].shape)
         r.contact[1:] ^= rng.random(r.contact[1:].shape) < 0.2
         r.qpos[1:, 2] -= 0.02 * rng.random(len(r.qpos) - 1)
+        r.qpos[1:, 7 + char.hinges.index("shoulder_l_x")] -= 0.5  # an arm through the trunk
     found = metrics.measure(char, ref, recordings)
     m, rate = char.model, 30.0
     sim, kin = mujoco.MjData(m), mujoco.MjData(m)
@@ -83,6 +115,7 @@ def test_metrics_against_slow_loop(char, ref):
     sip = [m.body(f"{part}_{side}").id for part in ("upper_arm", "thigh") for side in "lr"]
     s = {k: [] for k in KEYS}
     walked, human_walked, falls, human_falls = 0.0, 0.0, 0, 0
+    depths, torques, never = [], {}, resting_pairs(char)
     for rec in recordings:
         places, heads, human_heads, soles = [], [], [], []
         for k, f in enumerate(rec.frames):
@@ -111,7 +144,20 @@ def test_metrics_against_slow_loop(char, ref):
             low = character.geom_lowest(m, body_geoms, sim.geom_xpos[None], sim.geom_xmat[None]).min()
             if low < 0:
                 s["penetration_mm"].append(-1000 * low)
+            if k % metrics.EVERY == 0:
+                depth = own_depth(m, sim, never)
+                depths.append(1000 * depth)
             if k:
+                for i in range(2):
+                    if rec.contact[k, i] and rec.contact[k - 1, i]:
+                        low = soles[k][i][:, 2].argmin()
+                        way = soles[k][i][low] - soles[k - 1][i][low]
+                        s["own_slide_cm_s"].append(100 * rate * np.hypot(*way[:2]))
+                for u, h in enumerate(char.driven):
+                    group = "".join(c for c in char.hinges[h].split("_")[0] if not c.isdigit())
+                    spring = -m.jnt_stiffness[1 + h] * (rec.qpos[k, 7 + h] - m.qpos_spring[7 + h])
+                    for name in (group, ""):
+                        torques.setdefault(name, []).append((spring**2, (rec.action[k, u] * char.limits[u]) ** 2))
                 s["contact_agreement"] += [float(rec.contact[k, i] == ref.contact[f, i]) for i in range(2)]
                 s["torque_rms"] += list(rec.action[k] ** 2)
                 s["saturation"] += [float(abs(a) > 0.99) for a in rec.action[k]]
@@ -144,6 +190,11 @@ def test_metrics_against_slow_loop(char, ref):
     expected = {k: np.mean(v) for k, v in s.items() if v}
     expected["head_wobble_deg_s"] **= 0.5
     expected["torque_rms"] **= 0.5
+    expected["self_penetration_mm"] = np.percentile(depths, 95)
+    expected["self_penetration_share"] = np.mean(np.array(depths) > 10)
+    for name, pairs in torques.items():
+        spring, motor = np.sqrt(np.mean(pairs, axis=0))
+        expected["spring_share" + (f".{name}" if name else "")] = spring / (spring + motor)
     expected |= dict(clips=3, steps_per_m=falls / walked, human_steps_per_m=human_falls / human_walked)
     expected["completed"] = np.mean([not r.failed for r in recordings])
     expected["survival"] = np.mean([(len(r.frames) - 1) / (b - a) for r, a, b in zip(recordings, ref.first, ref.last)])
@@ -155,7 +206,7 @@ def test_metrics_against_slow_loop(char, ref):
 
 def test_metrics_of_kinematic(char, ref):
     """The reference itself: no error against itself; the human's figures are the ones that `mocap` counts."""
-    recordings = play.kinematic(char, ref)
+    recordings = metrics.kinematic(char, ref)
     assert [len(r.frames) for r in recordings] == [40, 90, 30] and [r.available for r in recordings] == [39, 89, 29]
     row = metrics.measure(char, ref, recordings)
     assert row["completed"] == row["survival"] == 1.0 and row["clips"] == 3
@@ -175,7 +226,7 @@ def test_metrics_of_kinematic(char, ref):
     lifted = ref.qpos.copy()
     lifted[:, 2] += 0.05
     assert any(r.contact.any() for r in recordings)
-    assert not any(r.contact.any() for r in play.kinematic(char, replace(ref, qpos=lifted)))
+    assert not any(r.contact.any() for r in metrics.kinematic(char, replace(ref, qpos=lifted)))
 
 
 def test_metrics_on_known_motion(char, ref):
@@ -263,7 +314,7 @@ def test_human_is_measured_before_the_scaling():
     for change in ((), ("root.scale_xy=0.5",)):
         c = character.load("jesse", set=change)
         r = retarget.reference(c, [clip])
-        rows.append(metrics.measure(c, r, play.kinematic(c, r)))
+        rows.append(metrics.measure(c, r, metrics.kinematic(c, r)))
     for key in ("human_steps_per_m", "human_jitter_m_s3"):
         assert rows[0][key] == pytest.approx(rows[1][key], rel=1e-3), key
 
@@ -316,7 +367,8 @@ def test_nothing_to_measure(char, ref):
         row = metrics.measure(char, still_ref, [one])
         assert row["completed"] == row["survival"] == 0.0 and row["root_cm"] == 0.0 and set(row) == set(KEYS)
         steps = ("contact_agreement", "jitter_m_s3", "human_jitter_m_s3", "steps_per_m", "human_steps_per_m")
-        for key in (*steps, "foot_slide_cm_s", "head_wobble_deg_s", "torque_rms", "saturation"):
+        steps += ("own_slide_cm_s", "foot_slide_cm_s", "head_wobble_deg_s", "torque_rms", "saturation", "spring_share")
+        for key in (*steps, *GROUPS):
             assert np.isnan(row[key]), key
         for count in (2, 3):
             few = Recording(*(v[:count] for v in (rec.frames, rec.qpos, rec.contact, rec.action)), True, 30)
@@ -329,9 +381,9 @@ def test_nothing_to_measure(char, ref):
 def test_a_real_first_step_failure(char, ref):
     def thrown(env):
         env.qpos[:, 0] += 5.0
-        return play.zero_action(env)
+        return metrics.zero_action(env)
 
-    recordings = play.simulate(char, ref, thrown, threads=1)
+    recordings = metrics.simulate(char, ref, thrown, threads=1)
     assert all(r.failed and len(r.frames) == 1 for r in recordings)
     assert not too_far(recordings[0].qpos[:, :3], ref.qpos[recordings[0].frames, :3]).any()
     row = metrics.measure(char, ref, recordings)
@@ -349,26 +401,26 @@ def test_sip_bodies(char):
 
 
 def test_table(char, ref):
-    row = metrics.measure(char, ref, play.kinematic(char, ref))
+    row = metrics.measure(char, ref, metrics.kinematic(char, ref))
     text = metrics.table({"policy": row | {"fails_every_s": float("inf")}, "kinematic": row})
     lines = text.splitlines()
     width = len(metrics.COLUMNS) + 1
     assert [line.count("|") for line in lines[:4]] == [width + 1] * 4
     cells = [c.strip() for c in lines[3].split("|")]
-    assert cells[1:4] == ["kinematic", "-", "-"] and cells[4 + 1] == "0.0"  # completed by definition: a dash
+    assert cells[1:4] == ["kinematic", "-", "-"] and cells[4 + 2] == "0.0"  # completed by definition: a dash
     assert "never" in lines[2] and "the human: jitter" in text and "3 sequences" in text
 
 
 def test_comparison(char, ref):
     """`table` turned round: the same cells, a metric a row and a policy a column."""
-    row = metrics.measure(char, ref, play.kinematic(char, ref))
+    row = metrics.measure(char, ref, metrics.kinematic(char, ref))
     results = {"runs/a": row | {"fails_every_s": float("inf")}, "b.npz": row, "kinematic jesse": row}
     grid = lambda text: [[c.strip() for c in r.split("|")[1:-1]] for r in text.splitlines() if "|" in r]  # noqa: E731
     found, turned = grid(metrics.comparison(results)), grid(metrics.table(results))
     assert found[0] == ["", "runs/a", "b.npz", "kinematic jesse"]
     found, turned = (np.array([r for r in g if r[0] != "---"]) for g in (found, turned))
     np.testing.assert_array_equal(found, turned.T)
-    assert found[3].tolist() == ["fails every s", "never", "-", "-"]
+    assert found[3].tolist() == ["fails every s", "never", "-", "-"] and found[4, 0] == "first fails s"
     assert metrics.comparison(results).splitlines()[-1] == metrics.table(results).splitlines()[-1]
 
 
@@ -377,3 +429,108 @@ def test_json():
     rows = {"a": {"x": float("nan"), "y": float("inf"), "z": 1.5, "n": 2}}
     clean = json.loads(metrics.as_json(rows), parse_constant=lambda c: pytest.fail(f"{c} is not JSON"))
     assert clean == {"a": {"x": None, "y": None, "z": 1.5, "n": 2}}
+
+
+# ------------------------------------------------------------------------------------ skating, springs, its own shapes
+
+
+def test_own_slide():
+    """A sole of two points: the lower one counts, only between two steps at which the foot presses."""
+    soles = np.zeros((4, 2, 2, 3))
+    soles[:, :, 1, 2] = 0.1  # the second point is higher
+    soles[:, 0, 0, 0] = [0.0, 0.1, 0.3, 0.6]
+    soles[:, 0, 1, 1] = 9.0 * np.arange(4)
+    contact = np.array([[1, 0], [1, 0], [1, 0], [0, 0]], bool)
+    np.testing.assert_allclose(metrics.own_slide(soles, contact, 30.0), [3.0, 6.0])
+    assert not len(metrics.own_slide(soles[:1], contact[:1], 30.0))
+
+
+def test_spring_share(char, ref):
+    """Springs alone: 1; motors alone: 0; as strong as each other: one half."""
+    still_ref, rec = still(char, ref)
+    bent = rec.qpos.copy()
+    knee = [k for k, h in enumerate(char.driven) if char.hinges[h].startswith("knee")]
+    hinge = char.driven[knee]
+    bent[:, 7 + hinge] += 0.3
+    torque = metrics.spring_torque(char, bent)
+    assert np.count_nonzero(torque[0]) == 2 and torque[0, knee[0]] == pytest.approx(-0.3 * 60.0)
+    row = metrics.measure(char, still_ref, [replace(rec, qpos=bent)])
+    assert row["spring_share.knee"] == 1.0 and np.isnan(row["spring_share.hip"])
+    action = np.zeros_like(rec.action)
+    action[:, knee] = torque[:, knee] / char.limits[knee]
+    row = metrics.measure(char, still_ref, [replace(rec, qpos=bent, action=action)])
+    assert row["spring_share.knee"] == pytest.approx(0.5) == row["spring_share"]
+    assert metrics.measure(char, still_ref, [replace(rec, action=action)])["spring_share.knee"] == 0.0
+    groups = metrics.driven_groups(character.load("dino"))
+    assert {"tail", "hip", "spine"} <= set(groups) and len(np.concatenate([*groups.values()])) == 37
+
+
+@pytest.mark.parametrize("name", ["jesse", "oppy", "dino"])
+def test_self_penetration(name):
+    """Nothing in the default pose; a forearm swung through the trunk is found, as deep as MuJoCo says."""
+    char = character.load(name)
+    own, m = metrics.OwnShapes(char), char.model
+    rest = np.concatenate([[0, 0, char.hip_height], char.rest[char.root], char.default])
+    assert own.overlap(rest[None])[0] == 0.0 and len(own.pairs) > 50
+    through = np.tile(rest, (9, 1))
+    through[:, 7 + char.hinges.index("shoulder_l_x")] = np.linspace(0, -1.2, 9)  # towards the body
+    depth = own.overlap(through)
+    assert depth[0] == 0.0 and depth[-1] > 0.01
+    data = mujoco.MjData(m)
+    data.qpos[:] = through[-1]
+    mujoco.mj_forward(m, data)
+    assert depth[-1] == pytest.approx(own_depth(m, data, resting_pairs(char)))
+
+
+# ------------------------------------------------------------------------------------ as a user plays it
+
+
+def test_streamed(char, ref):
+    """The stream's poses are the human's in the same world; the row counts stands, and scores all frames."""
+    clip = load("builtin", clips="walk_005")[0]
+    pos, quat, seen, scale = metrics.stream_of(char, clip[30:130])
+    led = 45 + 1 + 45 + (100 - 1 - 22.5)  # still, speeding up over 22.5 frames of the clip, the rest
+    assert len(pos) == len(quat) == len(seen) and abs(len(pos) - (led - 31)) <= 1
+    ref = retarget.reference(char, [seen])
+    np.testing.assert_allclose(pos, ref.sensor_pos / ref.sensor_scale[:, None] * scale, atol=1e-6)
+    assert np.abs(np.sum(quat * ref.sensor_quat, axis=-1)).min() > 1 - 1e-9
+    assert np.linalg.norm(pos[0, 0, :2]) < 1e-6 and abs(heading(quat[0, 0])) < 1e-6  # it begins at the origin, ahead
+    assert np.linalg.norm(np.diff(pos[:13], axis=0), axis=-1).max() < 1e-9 < np.linalg.norm(pos[40] - pos[0])
+    stand = load("builtin", clips="stand_007")[0][:90]
+    assert abs(len(metrics.stream_of(char, stand)[0]) - (45 + 90 - 31)) <= 1  # begins still: no speeding up
+
+    def nothing(obs):
+        return np.zeros((len(obs), len(char.limits)))
+
+    row = metrics.streamed(char, nothing, [clip[30:130], stand])
+    assert row["clips"] == 2 and row["completed"] == 0.0 and row["failures"] >= 4
+    assert 0 < row["survival"] < 0.7 and row["first_failure_s"] > 0.3
+    ticks = sum(len(metrics.stream_of(char, c)[0]) for c in (clip[30:130], stand))
+    assert row["fails_every_s"] == pytest.approx(ticks / 30 / row["failures"])
+    assert row["root_cm"] > 0 and row["jitter_m_s3"] < 1e5  # a stand is a jump, and no motion
+    one = metrics.streamed(char, nothing, [stand])
+    assert one["completed"] == 0.0 and set(one) == set(row)
+
+
+def test_halves(ref):
+    """What policies are chosen on and what is reported have no capture in common, and are all of it."""
+    names = {}
+    for half in metrics.HALVES:
+        single, long = metrics.motion_of(metrics.Options(motion="standing", half=half))
+        names[half] = [c.name for c in single]
+        assert all(c.seconds >= 20 for c in long)
+    assert not set(names["select"]) & set(names["report"])
+    assert sorted(names["select"] + names["report"]) == sorted(names["both"]) and len(names["both"]) == 12
+    with pytest.raises(UserError, match="--rows oracle: unknown; valid: streamed, tracked"):
+        metrics.motion_of(metrics.Options(rows=("oracle",)))
+
+
+def test_command(tmp_path, capsys, monkeypatch):
+    """python metrics.py: the streamed row first, and a JSON of the rows asked for."""
+    captures = [load("builtin", clips="walk_005")[0][:50]]
+    monkeypatch.setattr(metrics, "motion_of", lambda opt: (captures, captures))
+    more = ["--rows", "streamed,kinematic", "--threads", "1", "--json", str(tmp_path / "t.json")]
+    metrics.main(["--character", "jesse", *more])
+    rows = json.loads((tmp_path / "t.json").read_text())
+    assert list(rows) == ["streamed", "kinematic"] and rows["streamed"]["clips"] == 1
+    assert "| streamed |" in capsys.readouterr().out

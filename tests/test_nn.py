@@ -243,23 +243,6 @@ def test_mlp_matches_torch(rng, name):
         np.testing.assert_allclose(grad, p[key].grad.numpy(), rtol=1e-11, atol=1e-13)
 
 
-def test_widened_is_the_same_function():
-    rng = np.random.default_rng(3)
-    mlp = nn.MLP((7, 12, 9, 4), rng=rng, dtype=np.float64)
-    for name in ("b0", "b1", "b2"):
-        mlp.params[name][:] = rng.normal(size=mlp.params[name].shape)
-    wide = nn.widened(mlp, (7, 20, 9, 4), rng)
-    x = rng.normal(size=(30, 7))
-    np.testing.assert_allclose(wide(x), mlp(x), rtol=1e-12)
-    # the new units are silent, not dead: their outgoing weights have a gradient
-    y, cache = wide.forward(x)
-    _, dtheta = wide.backward(rng.normal(size=y.shape), cache)
-    assert np.abs(wide.unflatten(dtheta)["W1"][12:]).min() > 0
-    for sizes in ((7, 12, 4), (8, 20, 9, 4), (7, 20, 8, 4), (7, 20, 9, 5)):
-        with pytest.raises(ValueError, match="expected 4 from 7 to 4"):
-            nn.widened(mlp, sizes, rng)
-
-
 # ------------------------------------------------------------------------------------------ Gaussian head
 
 

@@ -9,7 +9,6 @@ import pytest
 import character
 import metrics
 import play
-import ppo
 import retarget
 from env import Env, headset_only
 from headset.reader import controllers_hang
@@ -18,7 +17,7 @@ from mocap import data
 from plumbing import render
 from plumbing.cli import UserError
 from plumbing.runs import save_checkpoint
-from ppo import Policy
+from policy import Policy, load_policy
 
 COLUMNS = [key for key, *_ in metrics.COLUMNS]
 pytestmark = pytest.mark.usefixtures("motions_once")
@@ -43,7 +42,7 @@ def long(char):
 def cheat(env):
     """No torque, but the state is put back on the reference first: it survives for as long as there are frames."""
     env.qpos[:], env.qvel[:] = env.ref.qpos[env.frame], env.ref.qvel[env.frame]
-    return play.zero_action(env)
+    return metrics.zero_action(env)
 
 
 # ------------------------------------------------------------------------------------ pushes
@@ -51,12 +50,12 @@ def cheat(env):
 
 def test_push(char, ref):
     """What the flag says, when the force acts, and the momentum it gives: N × 0.2 s along the heading."""
-    assert play.parse_push(None) is None and play.parse_push("200@2") == play.Push(200.0, 2.0, 0.0)
-    assert play.parse_push("50.5@.5:left") == play.Push(50.5, 0.5, np.pi / 2)
+    assert metrics.parse_push(None) is None and metrics.parse_push("200@2") == metrics.Push(200.0, 2.0, 0.0)
+    assert metrics.parse_push("50.5@.5:left") == metrics.Push(50.5, 0.5, np.pi / 2)
     for text in ("200", "200@", "-3@2", "200@2:up", "nan@2", "200@2:leftx"):
         with pytest.raises(UserError, match="valid: N@T or N@T:DIRECTION.*forward, left, back, right"):
-            play.parse_push(text)
-    push = play.parse_push("300@0.1:right")
+            metrics.parse_push(text)
+    push = metrics.parse_push("300@0.1:right")
     times = np.array([0.0, 0.09, 0.1, 0.29, 0.3, 1.0])
     assert np.flatnonzero(np.linalg.norm(push.force(times, np.zeros(6)), axis=1)).tolist() == [2, 3]
     assert np.allclose(push.force(0.1, np.pi / 2), [300, 0, 0])  # its right, when it looks along y
@@ -69,29 +68,29 @@ def test_push(char, ref):
     for _ in range(15):
         xfrc[:, char.root, :3] = push.force(env.steps * env.dt, yaw)
         com.append(env.com[0, char.root].copy())
-        env.step(play.zero_action(env))
+        env.step(metrics.zero_action(env))
     velocity = (com[14] - com[12]) / (2 * env.dt)
-    gain = 300 * play.PUSH_SECONDS / char.model.body_subtreemass[0]
+    gain = 300 * metrics.PUSH_SECONDS / char.model.body_subtreemass[0]
     np.testing.assert_allclose(velocity[:2], gain * np.array([np.sin(yaw), -np.cos(yaw)]), rtol=0.02, atol=0.01)
 
 
 def test_largest_push(char, ref, monkeypatch):
     """What it reports is survived, and a little more is not; without a survivor it says so."""
-    monkeypatch.setattr(play, "RECOVERY", 1.0)
-    found = play.largest_push(char, ref, cheat, 0.5, 60_000.0, rounds=5, threads=1)
+    monkeypatch.setattr(metrics, "RECOVERY", 1.0)
+    found = metrics.largest_push(char, ref, cheat, 0.5, 60_000.0, rounds=5, threads=1)
     assert found["tried"] == 1 and found["resolution"] == 60_000 / 32
-    for name, angle in play.DIRECTIONS.items():
+    for name, angle in metrics.DIRECTIONS.items():
         (most,) = found[name]
         assert 0 < most < 60_000
         for newtons, fails in ((most, False), (most + found["resolution"], True)):
-            rec = play.simulate(char, ref, cheat, only=[1], threads=1, push=play.Push(newtons, 0.5, angle))[0]
+            rec = metrics.simulate(char, ref, cheat, only=[1], threads=1, push=metrics.Push(newtons, 0.5, angle))[0]
             assert rec.failed is fails
-    text = play.push_report(found, play.Push(60_000.0, 0.5))
+    text = metrics.push_report(found, metrics.Push(60_000.0, 0.5))
     assert "1 of 1 sequences" in text and text.count("median") == 4
-    limp = play.largest_push(char, ref, lambda env: np.ones((env.n, env.action_size)), 0.5, 100.0, threads=1)
-    assert len(limp["left"]) == 0 and "0 of 1 sequences" in play.push_report(limp, play.Push(100.0, 0.5))
+    limp = metrics.largest_push(char, ref, lambda env: np.ones((env.n, env.action_size)), 0.5, 100.0, threads=1)
+    assert len(limp["left"]) == 0 and "0 of 1 sequences" in metrics.push_report(limp, metrics.Push(100.0, 0.5))
     with pytest.raises(UserError, match="no sequence is 31.0 s long"):
-        play.largest_push(char, ref, cheat, 30.0, 100.0)
+        metrics.largest_push(char, ref, cheat, 30.0, 100.0)
 
 
 # ------------------------------------------------------------------------------------ what drives it
@@ -103,18 +102,18 @@ def test_pd_action(char, ref):
     rng = np.random.default_rng(0)
     env.qpos[:, 7:] += 0.2 * rng.standard_normal((5, char.j))
     env.qvel[:] += rng.standard_normal(env.qvel.shape)
-    a = play.pd_action(env)
+    a = metrics.pd_action(env)
     assert a.shape == (5, char.model.nu) and np.abs(a).max() == 1.0 and (np.abs(a) < 1).any()
     for n in range(5):
         for k in range(char.model.nu):
             joint = char.model.actuator_trnid[k, 0]
             p, v = char.model.jnt_qposadr[joint], char.model.jnt_dofadr[joint]
             goal_p, goal_v = ref.qpos[env.frame[n], p], ref.qvel[env.frame[n], v]
-            x = play.PD_STIFFNESS * (goal_p - env.qpos[n, p]) + play.PD_DAMPING * (goal_v - env.qvel[n, v])
+            x = metrics.PD_STIFFNESS * (goal_p - env.qpos[n, p]) + metrics.PD_DAMPING * (goal_v - env.qvel[n, v])
             assert a[n, k] == pytest.approx(max(-1.0, min(1.0, x)))
     env.reset(0)
-    np.testing.assert_allclose(play.pd_action(env), 0.0, atol=1e-12)  # on the reference there is nothing to correct
-    np.testing.assert_array_equal(play.zero_action(env), np.zeros((5, char.model.nu)))
+    np.testing.assert_allclose(metrics.pd_action(env), 0.0, atol=1e-12)  # on the reference there is nothing to correct
+    np.testing.assert_array_equal(metrics.zero_action(env), np.zeros((5, char.model.nu)))
 
 
 def test_policy_action_is_the_mean(char, ref):
@@ -122,7 +121,7 @@ def test_policy_action_is_the_mean(char, ref):
     env.reset(0)
     rng = np.random.default_rng(0)
     policy = Policy(env.obs_size, env.critic_size, env.action_size, (8,), (4,), 5.0, 1.0, rng)
-    act = play.policy_action(policy)
+    act = metrics.policy_action(policy)
     np.testing.assert_array_equal(act(env), act(env))  # no noise, whatever σ
     np.testing.assert_array_equal(act(env), policy.mean_action(env.full[:, : env.obs_size]))
     before = act(env)
@@ -131,7 +130,7 @@ def test_policy_action_is_the_mean(char, ref):
 
 
 def test_simulate(char, ref):
-    recordings = play.simulate(char, ref, play.zero_action, threads=1)
+    recordings = metrics.simulate(char, ref, metrics.zero_action, threads=1)
     assert len(recordings) == 3 and any(r.failed for r in recordings)
     for i, rec in enumerate(recordings):
         env = Env(char, ref, 1, threads=1, autoreset=False)
@@ -151,7 +150,7 @@ def test_simulate(char, ref):
             assert env.step(np.zeros((1, env.action_size)))[2][0] and len(rec.frames) <= rec.available
         else:
             assert truncated[0] and rec.frames[-1] == ref.last[i] and len(rec.frames) == rec.available + 1
-    only = play.simulate(char, ref, play.zero_action, threads=1, only=[1])
+    only = metrics.simulate(char, ref, metrics.zero_action, threads=1, only=[1])
     assert len(only) == 1 and len(only[0].frames) == len(recordings[1].frames)
     np.testing.assert_allclose(only[0].qpos, recordings[1].qpos, atol=1e-9)
 
@@ -165,24 +164,24 @@ def test_what_happens_after_the_end_does_not_count(char, ref):
             env.qpos[2, 0] += 5.0
         return action
 
-    first, second, third = play.simulate(char, ref, fall_later, threads=1)
+    first, second, third = metrics.simulate(char, ref, fall_later, threads=1)
     assert not (first.failed or second.failed or third.failed)
     assert [len(r.frames) for r in (first, second, third)] == [40, 90, 30]
 
 
 def test_simulate_stops_at_500_steps(char, long):
     assert len(long) > 600
-    (rec,) = play.simulate(char, long, cheat, threads=1)
+    (rec,) = metrics.simulate(char, long, cheat, threads=1)
     assert not rec.failed and rec.available == 500 and len(rec.frames) == 501 and rec.frames[-1] == 500
-    (kin,) = play.kinematic(char, long)
+    (kin,) = metrics.kinematic(char, long)
     assert kin.available == 500 and len(kin.frames) == 501
-    (short,) = play.simulate(char, long, cheat, horizon=7, threads=1)
+    (short,) = metrics.simulate(char, long, cheat, horizon=7, threads=1)
     assert short.available == 7 and len(short.frames) == 8 and not short.failed
 
 
 def test_time_to_failure(char, long):
-    assert play.time_to_failure(char, long, cheat, n=3, seconds=1.0, threads=1) == float("inf")
-    found = play.time_to_failure(char, long, play.zero_action, n=6, seconds=3.0, seed=4, threads=1)
+    assert metrics.time_to_failure(char, long, cheat, n=3, seconds=1.0, threads=1) == float("inf")
+    found = metrics.time_to_failure(char, long, metrics.zero_action, n=6, seconds=3.0, seed=4, threads=1)
     env = Env(char, long, 6, threads=1, autoreset=False)
     draw = np.random.default_rng(4)  # the starts that the environment draws, replayed by hand
     env.reset(frames=draw.choice(env.starts, 6))
@@ -217,16 +216,17 @@ def policy_file(char, ref, tmp_path):
 
 
 def test_measure_json(policy_file, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(data, "sequences", lambda *_, **__: [data.load("builtin", clips="walk_005")[0][:70]])
-    monkeypatch.setattr(play, "time_to_failure", functools.partial(play.time_to_failure, seconds=1.0))
+    one = [data.load("builtin", clips="walk_005")[0][:70]]
+    monkeypatch.setattr(metrics, "motion_of", lambda opt: (one, one))
+    monkeypatch.setattr(metrics, "time_to_failure", functools.partial(metrics.time_to_failure, seconds=1.0))
     out = tmp_path / "table.json"
     args = ["--policy", str(policy_file), "--measure", "--json", str(out), "--threads", "1"]
     play.main([*args, "--random-starts", "4"])
     text = capsys.readouterr().out
     rows = json.loads(out.read_text(), parse_constant=lambda c: pytest.fail(f"{c} is not JSON"))
-    assert list(rows) == ["policy", "kinematic", "zero", "pd"]
+    assert list(rows) == ["streamed", "tracked", "kinematic", "zero", "pd"]
     for name, row in rows.items():
-        assert set(COLUMNS) - {"fails_every_s"} <= set(row), name
+        assert set(COLUMNS) - {"fails_every_s", "first_failure_s"} <= set(row), name
         assert ("fails_every_s" in row) == (name != "kinematic")
         assert all(v is None or isinstance(v, int | float) for v in row.values())
         assert f"| {name} |" in text
@@ -243,6 +243,7 @@ def test_split_and_all(policy_file, monkeypatch):
         raise UserError("enough")
 
     monkeypatch.setattr(data, "sequences", sequences)
+    monkeypatch.setattr(data, "load", lambda *a, **k: [])
     for more in ([], ["--split", "train"], ["--split", "style"], ["--all"], ["--clips", "*walk*", "--seed", "3"]):
         with pytest.raises(UserError, match="enough"):
             play.main(["--measure", "--policy", str(policy_file), *more])
@@ -257,17 +258,17 @@ def test_which_policy(policy_file, tmp_path, monkeypatch, char, ref):
         (tmp_path / name).write_bytes((character.CHARACTERS / name).read_bytes())
     monkeypatch.setattr(character, "CHARACTERS", tmp_path)
     with pytest.raises(UserError, match="no policy .*jesse.npz"):
-        play.find_policy(play.Options())
+        metrics.find_policy(play.Options())
     (tmp_path / "jesse.npz").write_bytes(policy_file.read_bytes())
-    assert play.find_policy(play.Options())[1] == tmp_path / "jesse.npz"  # shipped beside the character
+    assert metrics.find_policy(play.Options())[1] == tmp_path / "jesse.npz"  # shipped beside the character
     elsewhere = tmp_path / "mine" / "bob.toml"
     elsewhere.parent.mkdir()
     with pytest.raises(UserError, match="no character .*mine/bob.toml"):
-        play.find_policy(play.Options(character=str(elsewhere)))
+        metrics.find_policy(play.Options(character=str(elsewhere)))
     elsewhere.write_text((tmp_path / "jesse.toml").read_text())
     (elsewhere.parent / "jesse.xml").write_bytes((tmp_path / "jesse.xml").read_bytes())
     with pytest.raises(UserError, match="no policy .*mine/bob.npz"):
-        play.find_policy(play.Options(character=str(elsewhere)))
+        metrics.find_policy(play.Options(character=str(elsewhere)))
     other = Policy(7, 9, 2, (4,), (4,), 0.1, 1.0, np.random.default_rng(0))
     save_checkpoint(tmp_path / "other.npz", other.arrays(), {"policy": other.shape()})
     monkeypatch.undo()
@@ -280,13 +281,13 @@ def test_what_cannot_be_done_is_said_first(policy_file, tmp_path):
     """Before anything is simulated."""
     with pytest.raises(UserError, match="nothing to do: give --measure"):
         play.main(["--policy", str(policy_file)])
-    with pytest.raises(UserError, match="--json writes the table of --measure"):
+    with pytest.raises(UserError, match="--json writes the table of --measure, --compare or --stream"):
         play.main(["--policy", str(policy_file), "--json", "x.json", "--png", "x.png"])
     for flag, name in (("--json", "t.json"), ("--png", "t.png"), ("--video", "t.mp4")):
         with pytest.raises(UserError, match=f"cannot write .*{name}: there is no folder"):
             play.main(["--policy", str(policy_file), "--measure", flag, str(tmp_path / "none" / name)])
     with pytest.raises(UserError, match="--sequence 7: there are 1, from 0"):
-        play.main(["--policy", str(policy_file), "--measure", "--sequence", "7", "--clips", "walk_005"])
+        play.main(["--policy", str(policy_file), "--png", "x.png", "--sequence", "7", "--clips", "walk_005"])
     late = ["--policy", str(policy_file), "--clips", "walk_005", "--push", "100@9000"]
     with pytest.raises(UserError, match="no sequence is 9003.0 s long: push before [1-9]"):
         play.main([*late, "--measure"])
@@ -312,7 +313,7 @@ def test_character_of_the_policy(char, ref, tmp_path):
     meta = {"options": {"character": "oppy", "scale": 0.8, "set": "reward.contact=[0, 1]"}}
 
     def variant(meta=meta, **flags):
-        char = play.load_character(play.Options(**flags), meta, "p")
+        char = metrics.load_character(play.Options(**flags), meta, "p")
         return char.name, char.variant
 
     own = {"scale": 0.8, "set": ["reward.contact=[0, 1]"]}
@@ -332,24 +333,24 @@ def test_headset_only(char, ref, tmp_path):
     """§4.2: a policy of the headset alone sees it alone; another one's controllers hang; targets stay the user's."""
     less = headset_only(ref)
     full, hmd = ({"options": {"sensors": s}} for s in ("full", "hmd"))
-    assert play.shown_to(full, "p", ref, None) is ref and play.shown_to({}, "p", ref, "full") is ref
-    np.testing.assert_array_equal(play.shown_to(full, "p", ref, "hmd").sensor_pos, controllers_hang(ref).sensor_pos)
+    assert metrics.shown_to(full, "p", ref, None) is ref and metrics.shown_to({}, "p", ref, "full") is ref
+    np.testing.assert_array_equal(metrics.shown_to(full, "p", ref, "hmd").sensor_pos, controllers_hang(ref).sensor_pos)
     for flag in (None, "hmd"):
-        assert play.shown_to(hmd, "p", ref, flag).sensor_pos.shape == less.sensor_pos.shape
+        assert metrics.shown_to(hmd, "p", ref, flag).sensor_pos.shape == less.sensor_pos.shape
     with pytest.raises(UserError, match="p: was trained with the headset alone"):
-        play.shown_to(hmd, "p", ref, "full")
+        metrics.shown_to(hmd, "p", ref, "full")
 
-    policy, _ = ppo.load_policy(save_policy(tmp_path / "hmd.npz", char, less, sensors="hmd"))
+    policy, _ = load_policy(save_policy(tmp_path / "hmd.npz", char, less, sensors="hmd"))
     opt = play.Options(random_starts=0, threads=1)
     seen = []
-    act = lambda env: (seen.append(env.full.copy()), play.policy_action(policy)(env))[1]  # noqa: E731
-    row = play.measure_one("policy", char, ref, act, opt, less)
+    act = lambda env: (seen.append(env.full.copy()), metrics.policy_action(policy)(env))[1]  # noqa: E731
+    row = metrics.measure_one("policy", char, ref, act, opt, less)
     assert seen[0].shape[1] == 459 - 36
-    again = metrics.measure(char, ref, play.simulate(char, less, play.policy_action(policy), threads=1))
+    again = metrics.measure(char, ref, metrics.simulate(char, less, metrics.policy_action(policy), threads=1))
     assert row == pytest.approx(again, nan_ok=True)
     assert row["hands_cm"] > 1.0  # to the user's hands, which it was not shown
-    rows = play.measure_all(char, ref, policy, opt, less)
-    assert rows["policy"] == pytest.approx(row, nan_ok=True) and list(rows) == ["policy", "kinematic", "zero", "pd"]
+    rows = metrics.measure_all(char, ref, policy, opt, less)
+    assert rows["tracked"] == pytest.approx(row, nan_ok=True) and list(rows) == ["tracked", "kinematic", "zero", "pd"]
 
 
 # ------------------------------------------------------------------------------------ comparing
@@ -376,15 +377,16 @@ def test_compare(two, tmp_path, capsys):
     play.main(["--compare", *map(str, two), "--json", str(out), *more])
     text = capsys.readouterr().out
     rows = json.loads(out.read_text())
-    assert list(rows) == [*map(str, two), "kinematic jesse", "kinematic oppy scale 0.8"]
+    policies = [name for path in two for name in (f"{path} streamed", str(path))]
+    assert list(rows) == [*policies, "kinematic jesse", "kinematic oppy scale 0.8"]
     assert f"{two[0]}: jesse, 1.5k steps, without contact, headset only" in text
     assert f"{two[1]}: oppy scale 0.8, 1.5k steps\n" in text
     lines = [line for line in text.splitlines() if line.startswith("|")]
-    assert lines[0].split("|")[2:4] == [f" {p} " for p in two] and len(lines) == len(COLUMNS) + 2
+    assert lines[0].split("|")[2:6] == [f" {p} " for p in policies] and len(lines) == len(COLUMNS) + 2
     for path in two:
         play.main(["--policy", str(path), "--measure", "--json", str(out), *more])
         alone = json.loads(out.read_text())
-        assert alone["policy"] == rows[str(path)]
+        assert alone["tracked"] == rows[str(path)] and alone["streamed"] == rows[f"{path} streamed"]
     assert alone["kinematic"] == rows["kinematic oppy scale 0.8"]
     play.main([f"--compare={two[0]},{two[1]}", "--sensors", "hmd", "--json", str(out), *more])
     hanging = json.loads(out.read_text())
@@ -400,10 +402,10 @@ def test_comparison_sheet(two, tmp_path, monkeypatch):
         pytest.skip("no OpenGL")
     clips = data.sequences()
     opt = play.Options(compare=tuple(map(str, two)), threads=1)
-    arms = play.arms_of(clips, opt)
+    arms = metrics.arms_of(clips, opt)
     falls = lambda obs: np.ones((len(obs), arms[1].char.model.nu))  # noqa: E731
     arms[1].policy.mean_action = falls
-    lived = play.simulate(arms[1].char, arms[1].seen, lambda env: falls(env.full), threads=1, only=[0])[0]
+    lived = metrics.simulate(arms[1].char, arms[1].seen, lambda env: falls(env.full), threads=1, only=[0])[0]
     assert len(lived.frames) < 40
     sheet = play.comparison_sheet(arms, clips[0], opt, size=(96, 80))
     assert sheet.shape == (3 * (20 + 80), 8 * 96, 3) and sheet.dtype == np.uint8

@@ -52,7 +52,8 @@ def get(url):
 def policy(tmp_path_factory):
     """The run folder of an untrained policy: one tiny update."""
     out = tmp_path_factory.mktemp("run")
-    ppo.main(["--envs", "8", "--horizon", "4", "--steps", "32", "--minibatch", "32", "--out", str(out)])
+    small = "--recipe none --envs 8 --horizon 4 --steps 32 --minibatch 32".split()
+    ppo.main([*small, "--out", str(out)])
     return out
 
 

@@ -1,12 +1,12 @@
 """PPO: Appendix B's formulas against slow loops, finite differences and torch; the loop's bookkeeping; exact resume."""
 
 import itertools
-import json
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,21 +14,21 @@ import pytest
 from scipy.stats import norm
 
 import character
-import env
 import ppo
-import retarget
 from character import TERMS
-from env import Disturbance, Env, input_names
+from env import Env, Uniform
 from mocap import data
 from nn import check_gradient, gaussian_logp
-from plumbing import runs
+from plumbing import runs, training
 from plumbing.cli import UserError
 from plumbing.runs import CHECKPOINT, CONFIG, METRICS, load_checkpoint, read_config, read_metrics, save_checkpoint
-from ppo import Options, Policy, Trainer
+from policy import Policy, load_policy
+from ppo import Options, Trainer
 
 ROOT = Path(__file__).resolve().parent.parent
 TIMES = ("steps_per_s", "collect_s", "update_s")
-TINY = "--clips *stand* --envs 8 --horizon 8 --minibatch 32 --hidden 12 --value-hidden 10,8 --threads 1".split()
+TINY = "--recipe none --clips *stand* --envs 8 --horizon 8 --minibatch 32".split()
+TINY += "--hidden 12 --value-hidden 10,8 --threads 1".split()
 
 
 pytestmark = pytest.mark.usefixtures("motions_once")
@@ -40,8 +40,9 @@ def tiny(**changes):
 
 
 def trainer_of(char, ref, episode=500, **changes):
-    opt = tiny(episode=episode, **changes)
-    trainer = Trainer(opt, *ppo.environments(char, ref, opt))
+    opt = tiny(**changes)
+    asymmetric = "asymmetric" not in opt.without
+    trainer = Trainer(opt, Env(char, ref, opt.envs, opt.seed, opt.threads, episode, asymmetric=asymmetric))
     trainer.start()
     return trainer
 
@@ -232,28 +233,6 @@ def test_critic_loss_gradient():
     np.testing.assert_allclose(policy.value(x, rows=7), 3.0 * policy.critic(x)[:, 0])  # value_scale; in pieces
 
 
-def test_value_clip_gradient():
-    """½ mean of the larger square; no gradient once V has left old ± ε towards the target."""
-    policy, x, *_, target = policy_batch()
-    v, rng = policy.critic(x)[:, 0], np.random.default_rng(0)
-    old = v + rng.choice([-0.5, -0.1, 0.1, 0.5], len(v))
-    loss, gradient = ppo.critic_loss(policy, x, target, old, 0.2)
-    slow, kinds = 0.0, set()
-    for i in range(len(v)):
-        held = min(max(v[i], old[i] - 0.2), old[i] + 0.2)
-        slow += max((v[i] - target[i]) ** 2, (held - target[i]) ** 2) / (2 * len(v))
-        kinds.add((held == v[i], (held - target[i]) ** 2 > (v[i] - target[i]) ** 2))
-    assert kinds == {(True, False), (False, False), (False, True)}
-    assert loss == pytest.approx(slow, rel=1e-12) and loss > ppo.critic_loss(policy, x, target)[0]
-    theta = policy.critic.theta.copy()
-
-    def f(u):
-        policy.critic.theta[:] = u
-        return ppo.critic_loss(policy, x, target, old, 0.2)[0]
-
-    check_gradient(f, theta, gradient, rtol=1e-6, atol=1e-9)
-
-
 # ------------------------------------------------------------------------------------ what is collected
 
 
@@ -373,13 +352,6 @@ def test_epochs_and_rate_follow_kl(char, ref):
     assert t.adam_pi.lr == 2e-3
 
 
-def test_play_clips_observations_as_training(char, ref):
-    t = trainer_of(char, ref)
-    far = t.env.full + 100.0
-    want = t.policy.actor(t.policy.norm.normalise(far)[:, : t.env.obs_size])
-    np.testing.assert_allclose(t.policy.mean_action(far[:, : t.env.obs_size]), want, rtol=1e-5, atol=1e-6)
-
-
 def test_time_to_failure(char, ref):
     t = trainer_of(char, ref, envs=32, horizon=30)
     stats = t.collect()
@@ -419,46 +391,17 @@ def test_rate_follows_kl_and_sigma_has_a_floor(char, ref):
     assert t.adam_pi.lr == pytest.approx(1e-4 * 1.2)
 
 
-def test_linear_schedule(char, ref):
-    """Both learning rates fall to 0 at --steps, whatever the KL divergence; no epoch is left out for it."""
-    t = trainer_of(char, ref, schedule="linear", epochs=4, steps=48 * 4, target_kl=1e-6, lr=1e-2, value_lr=2e-2)
-    rates, per_update = [], 4 * 3  # epochs × minibatches
-    for k in range(4):
-        t.collect(), t.update()
-        rates.append((t.adam_pi.lr, t.adam_v.lr))
-        assert t.adam_pi.t == per_update * (k + 1)
-    np.testing.assert_allclose(rates, [(1e-2 * s, 2e-2 * s) for s in (1.0, 0.75, 0.5, 0.25)])
-
-
-def test_joint_clip(char, ref, monkeypatch):
-    """One norm over both gradients, the value's weighted; and advantages standardised minibatch by minibatch."""
-    given, seen = [], []
-    monkeypatch.setattr(ppo, "clip_grad_norm", lambda g, m: given.append((g.copy(), m)))
-    loss = ppo.policy_loss
-    monkeypatch.setattr(ppo, "policy_loss", lambda *a: seen.append(a[4]) or loss(*a))
-    sizes = []
-    for more in ({}, {"joint_clip": 0.5, "max_grad_norm": 0.3, "standardise_minibatch": True}):
-        t = trainer_of(char, ref, epochs=1, **more)
-        t.collect()
-        seen.clear(), given.clear()
-        t.update()
-        sizes.append([len(g) for g, _ in given])
-    both = t.policy.theta_pi.size + t.policy.critic.theta.size
-    apart = [t.policy.theta_pi.size] * 3 + [t.policy.critic.theta.size] * 3  # on one thread the critic comes second
-    assert sizes == [apart, [both] * 3] and given[0][1] == 0.3
-    np.testing.assert_allclose([a.mean() for a in seen], 0.0, atol=1e-6)
-    np.testing.assert_allclose([a.std() for a in seen], 1.0, atol=1e-3)
-
-
 # ------------------------------------------------------------------------------------ learning
 
 
 class Reach:
     """Points on a line, with the interface of Env: go to the target and stay; |x| > 2 fails, 12 steps truncate."""
 
-    ENDS, TERMS, name, training = Env.ENDS, Env.TERMS, "reach", {}
+    ENDS, TERMS, name = Env.ENDS, Env.TERMS, "reach"
     obs_size, critic_size, action_size, dt = 2, 3, 1, 0.1
-    value_scale, stats = (lambda self, gamma: 1.0 / (1.0 - gamma)), (lambda self: {})
+
+    def value_scale(self, gamma):
+        return 1.0 / (1.0 - gamma)
 
     def __init__(self, n):
         self.n, self.full = n, np.zeros((n, 3), np.float32)
@@ -547,9 +490,9 @@ def test_resume_is_exact(whole, tmp_path):
 
 
 def test_second_thread_changes_nothing(char, ref):
-    """Both halves are simulated, and actor and critic learn, the same side by side as one after the other."""
+    """Actor and critic learn the same side by side as one after the other; so do the characters."""
     one, two = (trainer_of(char, ref, envs=128, horizon=40, minibatch=1024, threads=n) for n in (1, 2))
-    assert two.two and not one.two and [e.n for e in two.envs] == [64, 64]
+    assert two.two and not one.two
     for t in (one, two):
         before = t.policy.critic.theta.copy(), t.policy.norm.count
         for _ in range(2):
@@ -566,70 +509,11 @@ def test_second_thread_changes_nothing(char, ref):
         ppo.aside(lambda: 1 / 0)()
 
 
-def test_halves(char, ref):
-    """From `ppo.HALVES` characters on there are two environments; each one's samples are what it does alone."""
-    t = trainer_of(char, ref, envs=65, horizon=12, threads=2, episode=5)
-    assert [e.n for e in t.envs] == [33, 32] and t.x.shape[:2] == (12, 65) and t.full.shape == (65, t.env.critic_size)
-    assert len(ppo.environments(char, ref, tiny(envs=65, norm_each_step=True))) == 1
-    assert [e.n for e in ppo.environments(char, ref, tiny(envs=63))] == [63]
-    stats, value = t.collect(), lambda full: t.policy.value(t.policy.norm.normalise(full))
-    terms = dict.fromkeys(TERMS, 0.0)
-    for k, rows in enumerate((slice(0, 33), slice(33, 65))):
-        twin = Env(char, ref, t.envs[k].n, threads=1, horizon=5)
-        twin.reset([t.opt.seed, k] if k else t.opt.seed)
-        for step in range(12):
-            np.testing.assert_array_equal(t.raw[step, rows], twin.full)
-            _, reward, terminated, truncated, info = twin.step(t.action[step, rows])
-            np.testing.assert_array_equal(t.reward[step, rows], reward)
-            after = value(np.where(truncated[:, None], info.get("final_critic", twin.full), twin.full))
-            expected = np.where(terminated, 0.0, after)
-            np.testing.assert_allclose(t.next_value[step, rows], expected, rtol=1e-4, atol=0.01)  # of 1,000
-            for name in terms:
-                terms[name] += info["terms"][name].sum() / (12 * 65)
-        assert truncated.sum() + t.truncated[:, rows].sum() > 20
-    for name, mean in terms.items():
-        assert stats[f"r_{name}"] == pytest.approx(mean, rel=1e-6)
-    assert not np.array_equal(t.action[0, :32], t.action[0, 33:])  # each explores by itself
-
-
-def test_resume_of_halves_is_exact(tmp_path):
-    """Two environments, which two threads simulate before the stop and one after it."""
-    many = ("--envs", "64", "--minibatch", "256")
-    train(tmp_path / "whole", 2 * 8, *many)
-    train(tmp_path / "a", 8, *many, "--threads", "2")
-    train(tmp_path / "a", 2 * 8, "--resume", "--threads", "1")
-    assert_same_run(tmp_path / "whole", tmp_path / "a")
-
-
-def test_resume_is_exact_when_disturbed(tmp_path):
-    """The same with everything on that draws random numbers: other users, device errors, pushes."""
-    more = "--augment --balance --sensor-offset 0.02 --sensor-noise 0.005 --push 5".split()
-    train(tmp_path / "whole", 4, *more)
-    train(tmp_path / "a", 2, *more)
-    train(tmp_path / "a", 4, "--resume")
-    assert_same_run(tmp_path / "whole", tmp_path / "a")
-
-
-def test_make_envs_augments(ref):
-    opt = Options(clips="*stand*", envs=5, horizon=4, threads=1, episode=77)
-    [plain], [again] = ppo.make_envs(opt), ppo.make_envs(replace(opt, out="elsewhere"))
-    assert plain.n == 5 and plain.horizon == 77 and plain.ref.names == ["stand_007"]
-    assert ppo.fingerprint(plain.ref) == ppo.fingerprint(again.ref)
-    assert plain.disturbance == Disturbance()  # nothing is added unless asked for
-    more = replace(opt, augment=True, sensor_offset=0.02, sensor_noise=0.01, push=0.3)
-    [env] = ppo.make_envs(more)
-    frames = len(plain.ref)
-    assert len(env.ref.names) == 2 and "mirrored" in env.ref.names[1]
-    np.testing.assert_array_equal(env.ref.qpos[:frames], plain.ref.qpos)
-    assert env.disturbance == Disturbance(sensor_offset=0.02, sensor_noise=0.01, push=0.3)
-    assert ppo.fingerprint(env.ref) == ppo.fingerprint(ppo.make_envs(more)[0].ref) != ppo.fingerprint(plain.ref)
-    assert ppo.fingerprint(env.ref) != ppo.fingerprint(ppo.make_envs(replace(more, seed=1))[0].ref)
-
-
-def test_resume_from_a_damaged_checkpoint(whole, tmp_path, capsys):
+def test_resume_from_a_damaged_checkpoint(whole, tmp_path, capsys, monkeypatch):
     """Cut short while it was written: the one before is taken, and the rows after it are made again."""
     out = tmp_path / "a"
-    train(out, 4, "--checkpoint-minutes", "0")
+    monkeypatch.setattr(ppo, "CHECKPOINT_SECONDS", 0)
+    train(out, 4)
     newest = out / CHECKPOINT
     newest.write_bytes(newest.read_bytes()[:-500])
     with open(out / METRICS, "a") as file:
@@ -645,7 +529,8 @@ def test_resume_from_a_damaged_checkpoint(whole, tmp_path, capsys):
 def test_resume_after_sigkill(tmp_path):
     """Killed among its checkpoints, which it writes after every update, a run continues to the same numbers."""
     out = tmp_path / "killed"
-    command = [sys.executable, "ppo.py", *TINY, "--steps", "1e9", "--checkpoint-minutes", "0", "--out", str(out)]
+    often = "import sys, ppo; ppo.CHECKPOINT_SECONDS = 0; ppo.main(sys.argv[1:])"
+    command = [sys.executable, "-c", often, *TINY, "--steps", "1e9", "--out", str(out)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     try:
         deadline = time.monotonic() + 60
@@ -662,7 +547,9 @@ def test_resume_after_sigkill(tmp_path):
     assert_same_run(tmp_path / "whole", out)
 
 
-def test_interrupt_ends_with_a_checkpoint(tmp_path, monkeypatch, capsys, whole):
+def test_interrupt_ends_with_a_checkpoint(tmp_path, monkeypatch, capsys, whole, request):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # some shells start their children without
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     lines = itertools.count(1)
     monkeypatch.setattr(runs.Progress, "update", lambda *_: next(lines) == 2 and signal.raise_signal(signal.SIGINT))
     _, meta = train(tmp_path / "a", 6)
@@ -694,9 +581,9 @@ def test_resume_refuses_other_options(whole, tmp_path, monkeypatch):
 
 
 def test_resume_accepts_what_changes_nothing(whole, tmp_path):
-    """The same value given again, other threads and other checkpoint times do not make it another run."""
+    """The same value given again and other threads do not make it another run."""
     train(tmp_path / "a", 2)
-    same = ["--lr", "1e-4", "--hidden", "12", "--threads", "2", "--checkpoint-minutes", "0"]
+    same = ["--lr", "1e-4", "--hidden", "12", "--threads", "2"]
     train(tmp_path / "a", 6, "--resume", *same)
     assert_same_run(whole, tmp_path / "a")
 
@@ -716,7 +603,7 @@ def test_resume_refuses_a_foreign_checkpoint(whole, tmp_path):
     train(tmp_path / "a", 1)
     arrays, meta = load_checkpoint(whole / CHECKPOINT)
     path = tmp_path / "a" / CHECKPOINT
-    for change in ({k: v for k, v in arrays.items() if "adam" not in k}, arrays | {"env0.frame": np.zeros(3, int)}):
+    for change in ({k: v for k, v in arrays.items() if "adam" not in k}, arrays | {"env.frame": np.zeros(3, int)}):
         save_checkpoint(path, change, meta)
         path.with_suffix(".prev.npz").unlink()  # a damaged one would be replaced by the one before
         with pytest.raises(UserError, match="does not fit|no array"):
@@ -732,240 +619,154 @@ def test_init_fine_tunes(whole, tmp_path, monkeypatch):
     for name, value in seen[0].items():  # weights, σ and normaliser
         np.testing.assert_array_equal(value, saved[name], err_msg=name)
     assert meta["updates"] == 1 and meta["steps"] == 64
-    for flag in ("--hidden", "--value-hidden"):
-        with pytest.raises(UserError, match=r"networks are \(12,\) and \(10, 8\), with .* give --hidden"):
+    for flag, name in (("--hidden", r"hidden \(12,\), not \(9,\)"), ("--value-hidden", r"value_hidden \(10, 8\), not")):
+        with pytest.raises(UserError, match=f"does not fit jesse: {name}.*extras.policies carry .* --character jesse"):
             train(tmp_path / "b", 1, "--init", str(whole), flag, "9")
     policy = Policy(7, 9, 2, (4,), (4,), 0.1, 1.0, np.random.default_rng(0))
     save_checkpoint(tmp_path / "other.npz", policy.arrays(), {"policy": policy.shape()})
-    with pytest.raises(UserError, match="7 observations and 2 actions; jesse needs"):
-        train(tmp_path / "b", 1, "--init", str(tmp_path / "other.npz"))
+    with pytest.raises(UserError, match="obs_size 7, not 189; .*action_size 2, not 33; .*policies carry"):
+        train(tmp_path / "b", 1, "--init", str(tmp_path / "other.npz"), "--hidden", "4", "--value-hidden", "4")
     with pytest.raises(UserError, match="no checkpoint"):
         train(tmp_path / "b", 1, "--init", str(tmp_path / "missing.npz"))
     assert not (tmp_path / "b").exists()
 
 
-def test_init_widens():
-    rng = np.random.default_rng(1)
-    old = Policy(9, 11, 3, (8, 6), (7,), 0.1, 2.0, rng)
-    old.norm.update(rng.normal(2.0, 3.0, (50, 11)))
-    new = Policy(9, 11, 3, (16, 6), (12,), 0.5, 2.0, rng)
-    new.begin_from(old, "a.npz", rng)
-    x = rng.normal(2.0, 3.0, (20, 11)).astype(np.float32)
-    np.testing.assert_allclose(new.mean_action(x[:, :9]), old.mean_action(x[:, :9]), atol=1e-6)
-    np.testing.assert_allclose(new.value(new.norm.normalise(x)), old.value(old.norm.normalise(x)), rtol=1e-5)
-    np.testing.assert_array_equal(new.log_std, old.log_std)
-    with pytest.raises(UserError, match="a.npz: its networks are"):
-        Policy(9, 11, 3, (8, 5), (7,), 0.1, 2.0, rng).begin_from(old, "a.npz", rng)
-
-
 def test_init_brings_its_widths(whole, tmp_path):
-    """Layers are as wide as those of --init where the command line does not say; --share alone averages nothing."""
+    """Layers are as wide as those of --init where the command line does not say, whatever the recipe says."""
     small = [a for a in TINY if a not in ("--hidden", "12", "--value-hidden", "10,8")]
     ppo.main([*small, "--init", str(whole), "--steps", "64", "--out", str(tmp_path / "a")])
-    policy, _ = ppo.load_policy(tmp_path / "a")
+    policy, _ = load_policy(tmp_path / "a")
     assert (policy.hidden, policy.value_hidden) == ((12,), (10, 8))
-    ppo.main([*small, "--init", str(whole), "--hidden", "20", "--steps", "64", "--out", str(tmp_path / "b")])
-    policy, _ = ppo.load_policy(tmp_path / "b")
-    assert (policy.hidden, policy.value_hidden) == ((20,), (10, 8))
-    with pytest.raises(UserError, match="--share is of --blend"):
-        ppo.main(["--ship", str(tmp_path / "c.npz"), "--share", "0.3", "--out", str(tmp_path / "a")])
-    assert not (tmp_path / "c.npz").exists()
+    with pytest.raises(UserError, match=r"hidden \(12,\), not \(20,\)"):
+        ppo.main([*small, "--init", str(whole), "--hidden", "20", "--steps", "64", "--out", str(tmp_path / "b")])
+
+
+def test_init_points_to_carry(whole, tmp_path):
+    """Another character, fewer sensors or a critic that sees less: one line with the command that makes it fit."""
+    for more, says in (
+        (("--character", "dino"), "it is jesse's; obs_size 189, not 217"),
+        (("--sensors", "hmd"), "obs_size 189, not 153; critic_size 459, not 423"),
+        (("--without", "asymmetric"), "critic_size 459, not 189"),
+    ):
+        with pytest.raises(UserError, match=f"{says}.*python -m extras.policies carry {whole} NEW.npz") as error:
+            train(tmp_path / "b", 1, "--init", str(whole), *more)
+        assert "\n" not in str(error.value)
+    assert not (tmp_path / "b").exists()
 
 
 def test_line_of_progress(char, ref):
     t = trainer_of(char, ref, horizon=1)
     stats = t.collect() | dict.fromkeys(("steps_per_s", "kl", "clip_fraction", "explained_variance", "sigma"), 0.0)
-    assert stats["failures"] == 0 and ppo.progress_line(stats)["fails every"] == "never"
-    assert ppo.progress_line(stats | {"failures": 2, "time_to_failure": 1.5})["fails every"] == "1.50 s"
-
-
-def test_init_symmetric(whole, tmp_path, capsys, char, ref):
-    """§5.3: the actor goes on, the critic, which sees less, begins; the other way round nothing fits."""
-    _, meta = train(tmp_path / "a", 1, "--init", str(whole), "--without", "asymmetric")
-    says = f"{whole}: its critic sees 459 numbers, this one's only the actor's 189: the critic begins anew"
-    assert says in capsys.readouterr().out
-    assert meta["options"]["without"] == ["asymmetric"] and meta["policy"]["critic_size"] == 189
-    old, _ = ppo.load_policy(whole)
-    new = trainer_of(char, ref, without=("asymmetric",)).policy
-    critic = new.critic.theta.copy()
-    new.begin_from(old, "a.npz", np.random.default_rng(0))
-    x = np.random.default_rng(1).normal(size=(20, 189)).astype(np.float32)
-    np.testing.assert_allclose(new.mean_action(x), old.mean_action(x), atol=1e-6)
-    np.testing.assert_array_equal(new.critic.theta, critic)
-    with pytest.raises(UserError, match="with 189 inputs for the critic"):
-        train(tmp_path / "b", 1, "--init", str(tmp_path / "a"))
-
-
-def test_init_headset_only(whole, tmp_path, char):
-    """§4.2: where the controllers' numbers are at their means, the policy without them does and expects the same."""
-    rng = np.random.default_rng(0)
-    old, _ = ppo.load_policy(whole)
-    keep = [input_names(char).index(n) for n in input_names(char, 1)]
-    new = old.rearranged(keep, 189 - 36, np.arange(33))
-    gone = np.setdiff1d(np.arange(459), keep)
-    assert (new.obs_size, new.critic_size) == (153, 423) and len(gone) == 36 and gone.max() < 189
-    x = (old.norm.mean + rng.normal(size=(50, 459)) / old.norm.inv_std).astype(np.float32)
-    x[:, gone] = old.norm.mean[gone]
-    np.testing.assert_allclose(new.mean_action(x[:, keep[:153]]), old.mean_action(x[:, :189]), atol=1e-6)
-    np.testing.assert_allclose(new.value(new.norm.normalise(x[:, keep])), old.value(old.norm.normalise(x)), rtol=1e-5)
-    moved = x.copy()
-    moved[:, gone] += 1.0
-    assert np.abs(old.mean_action(moved[:, :189]) - old.mean_action(x[:, :189])).max() > 1e-4  # they had mattered
-    np.testing.assert_array_equal(new.log_std, old.log_std)
-
-    _, meta = train(tmp_path / "a", 1, "--init", str(whole), "--sensors", "hmd", "--hidden", "16")
-    assert meta["options"]["sensors"] == "hmd" and meta["policy"]["obs_size"] == 153
-    train(tmp_path / "a", 2, "--resume")
-    train(tmp_path / "b", 1, "--init", str(tmp_path / "a"), "--sensors", "hmd", "--hidden", "16")
-    with pytest.raises(UserError, match="trained with the headset alone: give --sensors hmd"):
-        train(tmp_path / "c", 1, "--init", str(tmp_path / "a"), "--hidden", "16")
-    arrays, meta = load_checkpoint(tmp_path / "a" / CHECKPOINT)
-    save_checkpoint(tmp_path / "p.npz", arrays, meta | {"options": {"sensors": "three"}})
-    with pytest.raises(UserError, match="p.npz: its options have sensors 'three'; valid: full, hmd"):
-        train(tmp_path / "c", 1, "--init", str(tmp_path / "p.npz"), "--sensors", "hmd")
+    assert stats["failures"] == 0 and t.line(stats)["fails every"] == "never"
+    assert t.line(stats | {"failures": 2, "time_to_failure": 1.5})["fails every"] == "1.50 s"
 
 
 def test_switches_reach_the_environment():
     """Each flag, and the variant of the character, in the environment that is trained."""
     opt = Options(clips="*stand*", envs=3, threads=1)
-    [plain] = ppo.make_envs(opt)
-    [env] = ppo.make_envs(replace(opt, without=("contact", "action", "asymmetric"), sensors="hmd", scale=0.9))
+    plain = ppo.make_env(opt)
+    env = ppo.make_env(replace(opt, without=("contact", "action", "asymmetric"), sensors="hmd", scale=0.9))
     assert {t for t in TERMS if env.char.reward[t][0] == 0} == {"contact", "action_diff", "action_min"}
     assert (env.devices, env.asymmetric, env.char.variant) == (1, False, {"scale": 0.9})
     assert (plain.devices, plain.asymmetric, plain.char.variant) == (3, True, {})
-    [env] = ppo.make_envs(replace(opt, track="root"))
+    assert type(plain.starts) is Uniform and plain.disturbance is None and plain.root_limit == 0.30  # the paper's
+    env = ppo.make_env(replace(opt, track="root"))
     assert env.char.reward["q"][0] == 0 < env.char.reward["x"][0] and env.ref.link_pos.shape[1] == 1
     for wrong in (["--without", "contact,gravity"], ["--track", "head"], ["--sensors", "none"]):
         with pytest.raises(SystemExit):
-            ppo.main(["--out", "nowhere", *wrong])
+            ppo.main(["--recipe", "none", "--out", "nowhere", *wrong])
 
 
-def test_noise_is_the_characters(char, ref):
-    """σ: of the command line, else of the character's [training], else of NOISE; what was used is recorded."""
-    other = replace(char, training={"sigma": 0.06})
-    for c, given, sigma, least in (
-        (char, {}, 0.135, 0.05),
-        (other, {}, 0.06, 0.05),
-        (other, {"sigma": 0.2}, 0.2, 0.05),
-    ):
-        t = trainer_of(c, ref, **given)
-        assert (t.opt.sigma, t.opt.min_sigma) == (sigma, least)
-        np.testing.assert_allclose(t.policy.log_std, np.log(sigma), rtol=1e-6)
+def test_sensors_reach_the_run(tmp_path):
+    """§4.2: a run with the headset alone, resumed, and gone on from."""
+    _, meta = train(tmp_path / "a", 1, "--sensors", "hmd")
+    assert meta["options"]["sensors"] == "hmd" and meta["policy"]["obs_size"] == 153
+    train(tmp_path / "a", 2, "--resume")
+    _, meta = train(tmp_path / "b", 1, "--init", str(tmp_path / "a"), "--sensors", "hmd")
+    assert meta["before"] == 128
 
 
-def test_init_of_another_character(whole, tmp_path, capsys):
-    """What has the same name goes on, whatever its place; the rest is silent; normaliser and σ begin anew."""
-    old, _ = ppo.load_policy(whole)
-    _, meta = train(tmp_path / "dino", 1, "--character", "dino", "--init", str(whole))
-    assert "jesse's policy: 459 of 487 inputs and 33 of 37 torques" in capsys.readouterr().out
-    assert meta["policy"]["action_size"] == 37
-    jesse, dino = character.load("jesse"), character.load("dino")
-    clip = data.builtin_clips()[0][:40]
-    a, b = (Env(c, retarget.reference(c, [clip]), 3, threads=1) for c in (jesse, dino))
-    new = ppo.initial_policy(whole, b, 0.07)
-    np.testing.assert_allclose(new.log_std, np.log(0.07), rtol=1e-6)
-    assert new.norm.count == 0
-    names = [env.input_names(c) for c in (jesse, dino)]
-    assert [len(n) for n in names] == [a.full.shape[1], b.full.shape[1]]
-    x = np.random.default_rng(0).normal(size=(5, len(names[0]))).astype(np.float32)
-    y = np.random.default_rng(1).normal(size=(5, len(names[1]))).astype(np.float32)  # what is new can be anything
-    for i, name in enumerate(names[1]):
-        if name in names[0]:
-            y[:, i] = x[:, names[0].index(name)]
-    had, has = old.actor(x[:, : old.obs_size]), new.actor(y[:, : new.obs_size])
-    for k, h in enumerate(dino.driven):
-        hinge = dino.hinges[h]
-        want = had[:, jesse.hinges.index(hinge)] if hinge in jesse.hinges else 0.0
-        np.testing.assert_allclose(has[:, k], want, atol=1e-5, err_msg=hinge)
-    np.testing.assert_allclose(new.critic(y), old.critic(x), atol=1e-5)
+def own_recipe(folder, text):
+    """A Jesse with another [training].  -> path of its .toml"""
+    before, _, after = (character.CHARACTERS / "jesse.toml").read_text().partition("[training]")
+    (folder / "own.toml").write_text(f"{before}[training]\n{text}\n{after[after.index('# ---') :]}")
+    shutil.copy(character.CHARACTERS / "jesse.xml", folder)
+    return str(folder / "own.toml")
 
 
-def test_init_of_a_variation(tmp_path):
-    """Dino's tail without motors: four are gone, the others' torques and the normaliser are as they were."""
-    clip, rng = data.builtin_clips()[0][:40], np.random.default_rng(0)
-    whole, limp = (character.load("dino", tail=tail) for tail in (None, "passive"))
-    a, b = (Env(c, retarget.reference(c, [clip]), 3, threads=1) for c in (whole, limp))
-    assert a.obs_size == b.obs_size and a.action_size == b.action_size + 4
-    old = Policy(a.obs_size, a.critic_size, a.action_size, (8,), (4,), 0.1, 1.0, rng)
-    old.norm.update(rng.normal(size=(50, a.critic_size)))
-    save_checkpoint(tmp_path / "p.npz", old.arrays(), {"policy": old.shape(), "options": {"character": "dino"}})
-    new = ppo.initial_policy(tmp_path / "p.npz", b, 0.3)
-    x = rng.normal(size=(5, a.obs_size)).astype(np.float32)
-    kept = [k for k, h in enumerate(whole.driven) if not whole.hinges[h].startswith("tail")]
-    np.testing.assert_allclose(new.mean_action(x), old.mean_action(x)[:, kept], atol=1e-6)
-    np.testing.assert_array_equal(new.norm.mean, old.norm.mean)
-    np.testing.assert_array_equal(new.log_std, old.log_std[kept])
+def recipe_options(*argv):
+    return training.read_options(Options, list(argv), "ppo.py", "")
 
 
-def test_policy_round_trip(tmp_path, char, ref):
-    """What is played is what was trained: the normaliser is in the file, and frozen."""
+def test_recipe(tmp_path, monkeypatch):
+    """The command line wins over the character's [training], that over the defaults; `by` says who trains."""
+    monkeypatch.chdir(tmp_path)
+    ours = own_recipe(tmp_path, "sigma = 0.06\nlr = 2e-5\nhidden = [24, 12]\nhorizon = 4\ntarget_kl = 1")
+    opt = recipe_options("--character", ours, "--lr", "1e-3")
+    assert (opt.sigma, opt.lr, opt.hidden, opt.horizon, opt.target_kl) == (0.06, 1e-3, (24, 12), 4, 1)
+    assert (opt.min_sigma, opt.value_hidden, opt.out) == (0.05, (256, 128), "runs/own")
+    changed = recipe_options("--character", ours, "--set", "training.sigma=0.2")
+    assert changed.sigma == 0.2 and changed.horizon == 4
+    plain = recipe_options("--character", ours, "--recipe", "none")
+    assert replace(plain, character="jesse", recipe="character") == Options(out="runs/own")
+    with pytest.raises(UserError, match=r'jesse.toml: \[training\] augment, balance, .*retry, .*by = "extras.train"'):
+        recipe_options("--character", "jesse")
+    with pytest.raises(SystemExit):
+        recipe_options("--recipe", "mine")
+    by = lambda *argv: training.trained_by(character.Switches, argv, "ppo")  # noqa: E731
+    assert by() == by("--character=dino", "--horizon", "9") == "extras.train"
+    assert by("--recipe", "none") == by("--character", ours) == by("--help") == "ppo"
+    with pytest.raises(UserError, match="no character 'jessy'"):
+        by("--character", "jessy")
+    assert training.value_of(["--out", "a", "--out=b", "--x"], "out") == "b"
+    assert training.value_of(["--out"], "out") is training.value_of([], "out") is None
+    assert training.given_names(["--no-balance", "--lr=1", "x", "--norm-x"]) == {"balance", "lr", "norm_x"}
+    run = recipe_options(*TINY, "--sigma", "0.3")
+    t = Trainer(run, ppo.make_env(run))
+    np.testing.assert_allclose(t.policy.log_std, np.log(0.3), rtol=1e-6)
+
+
+def test_what_was_used_is_recorded(tmp_path):
+    """A recipe's values, not its name, are in the run's folder, and a resumed run has them from there."""
+    small = [a for a in TINY if a not in ("--recipe", "none", "--horizon", "8")]
+    ours = own_recipe(tmp_path, "horizon = 8\nsigma = 0.2")
+    ppo.main([*small[:3], "8", *small[3:], "--character", ours, "--steps", "64", "--out", str(tmp_path / "a")])
+    config = read_config(tmp_path / "a")["config"]
+    assert (config["horizon"], config["sigma"], config["by"]) == (8, 0.2, "ppo")
+    _, meta = train(tmp_path / "a", 2, "--resume")
+    assert meta["options"]["horizon"] == 8 and meta["updates"] == 2
+
+
+def test_few_options():
+    """What a reader has to read: twenty-five at most beside the character's and the motion's."""
+    shared = {f.name for base in (character.Switches, data.MotionFlags) for f in fields(base)}
+    assert len({f.name for f in fields(Options)} - shared) <= 25
+    assert len((ROOT / "ppo.py").read_text().splitlines()) <= 450
+    assert len((ROOT / "env.py").read_text().splitlines()) <= 600
+
+
+def test_normaliser_learns_raw_observations(char, ref):
+    """Mean and variance are those of what the environment showed, not of what the networks saw."""
     t = trainer_of(char, ref)
-    t.collect(), t.update()
-    t.save(tmp_path / CHECKPOINT, {"options": {"character": "jesse"}})
-    for path in (tmp_path, tmp_path / CHECKPOINT):
-        policy, meta = ppo.load_policy(path)
-        assert meta["steps"] == t.steps and meta["options"]["character"] == "jesse"
-        for name, value in t.policy.arrays().items():
-            np.testing.assert_array_equal(policy.arrays()[name], value, err_msg=name)
-        obs = t.env.full[:, : t.env.obs_size]
-        expected = t.policy.actor(t.policy.norm.normalise(t.env.full)[:, : t.env.obs_size])
-        np.testing.assert_array_equal(policy.mean_action(obs), expected)
-        assert policy.norm.frozen and np.abs(policy.norm.mean).max() > 0.1
-        policy.norm.update(np.full((100, t.env.critic_size), 50.0))
-        np.testing.assert_array_equal(policy.mean_action(obs), expected)
-    ppo.check_fits(policy, t.env, tmp_path)
-
-
-def test_broken_policies(tmp_path):
-    policy = Policy(7, 9, 2, (4,), (4,), 0.1, 1.0, np.random.default_rng(0))
-    arrays, meta = policy.arrays(), {"policy": policy.shape()}
-    path = tmp_path / "p.npz"
-    save_checkpoint(path, arrays, meta)
-    whole = path.read_bytes()
-    assert ppo.load_policy(path)[0].shape() == policy.shape()
-
-    def saved(new_arrays=arrays, new_meta=meta):
-        save_checkpoint(path, new_arrays, new_meta)
-
-    def foreign():
-        np.savez(path, a=np.zeros(3))
-
-    nan = arrays["policy.pi"].copy()
-    nan[3] = np.nan
-    cases = [
-        lambda: path.write_bytes(whole[: len(whole) // 2]),
-        lambda: path.write_bytes(b""),
-        lambda: path.write_text("not a zip"),
-        foreign,
-        lambda: saved(new_meta={}),
-        lambda: saved(new_meta={"policy": 3}),
-        lambda: saved(new_meta={"policy": meta["policy"] | {"hidden": [5]}}),
-        lambda: saved(new_meta={"policy": meta["policy"] | {"hidden": ["x"]}}),
-        lambda: saved(new_meta={"policy": meta["policy"] | {"more": 1}}),
-        lambda: saved({k: v for k, v in arrays.items() if k != "policy.pi"}),
-        lambda: saved({k: v for k, v in arrays.items() if k != "policy.norm.count"}),
-        lambda: saved(arrays | {"policy.pi": np.zeros(1, np.float32)}),  # would broadcast
-        lambda: saved(arrays | {"policy.norm.mean": np.zeros(3)}),
-        lambda: saved(arrays | {"policy.pi": nan}),
-    ]
-    for i, breaks in enumerate(cases):
-        breaks()
-        with pytest.raises(UserError, match="p.npz") as error:
-            ppo.load_policy(path)
-        assert len(str(error.value).splitlines()) == 1, i
-    for missing in (tmp_path / "none.npz", tmp_path / "none"):
-        with pytest.raises(UserError, match="no checkpoint"):
-            ppo.load_policy(missing)
-    path.unlink()
-    with pytest.raises(UserError, match="holds no checkpoint"):
-        ppo.load_policy(tmp_path)
+    seen, step = [t.env.full.copy()], t.env.step  # the first observation counts twice: `start` begins with it
+    t.env.step = lambda a: (seen.append(t.env.full.copy()), step(a))[1]
+    for _ in range(3):
+        t.collect(), t.update()
+    rows = np.concatenate(seen).astype(float)
+    assert t.policy.norm.count == len(rows) == 6 * (3 * 8 + 1)
+    np.testing.assert_allclose(t.policy.norm.mean64, rows.mean(0), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(t.policy.norm.var, rows.var(0), rtol=1e-5, atol=1e-8)
+    assert np.abs(rows.mean(0)).max() > 1.0  # normalised ones would be about 0
 
 
 def test_fingerprint(char, ref):
-    assert ppo.fingerprint(ref) == ppo.fingerprint(replace(ref, qpos=ref.qpos.copy()))
+    told = training.motions(ref)
+    assert told == training.motions(replace(ref, qpos=ref.qpos.copy())) and told["sequences"] == len(ref.names)
+    assert told["minutes"] == pytest.approx(len(ref) / 30 / 60)
+    assert told["fingerprint"] == training.fingerprint(np.asfortranarray(ref.qpos))
     moved = ref.qpos.copy()
     moved[5, 8] += 1e-12
-    assert ppo.fingerprint(ref) != ppo.fingerprint(replace(ref, qpos=moved))
+    assert told["fingerprint"] != training.fingerprint(moved)
 
 
 def test_config_tells_what_was_run(whole):
@@ -974,71 +775,3 @@ def test_config_tells_what_was_run(whole):
     assert (whole / CONFIG).exists() and {"python", "mujoco"} <= set(config["versions"])
 
 
-def test_blended(tmp_path):
-    """Shares of 0 and 1 are the two policies; between them weights, and the normaliser's variances, are means."""
-    paths = tmp_path / "old", tmp_path / "new"
-    for seed, path in enumerate(paths):
-        train(path, 2, "--seed", str(seed))
-    obs = np.random.default_rng(0).standard_normal((5, ppo.load_policy(paths[0])[0].obs_size)).astype(np.float32)
-    old, new = (ppo.load_policy(p)[0] for p in paths)
-    for share, like in ((0.0, new), (1.0, old)):
-        assert ppo.ship(paths[1], tmp_path / "b.npz", paths[:1], share)["blend"] == {"with": ["old"], "share": share}
-        got = ppo.load_policy(tmp_path / "b.npz")[0]
-        np.testing.assert_allclose(got.mean_action(obs), like.mean_action(obs), atol=1e-5)
-    ppo.main(["--ship", str(tmp_path / "b.npz"), "--out", str(paths[1]), "--blend", str(paths[0]), "--share", "0.25"])
-    got = ppo.load_policy(tmp_path / "b.npz")[0]
-    np.testing.assert_allclose(got.theta_pi, 0.75 * new.theta_pi + 0.25 * old.theta_pi, atol=1e-6)
-    np.testing.assert_allclose(got.norm.var, 0.75 * new.norm.var + 0.25 * old.norm.var, rtol=1e-5)
-    np.testing.assert_allclose(got.norm.mean, 0.75 * new.norm.mean + 0.25 * old.norm.mean, atol=1e-5)
-    ppo.ship(paths[1], tmp_path / "b.npz", [paths[0], paths[0], paths[1]], 0.75)
-    np.testing.assert_allclose(
-        ppo.load_policy(tmp_path / "b.npz")[0].theta_pi, 0.5 * (new.theta_pi + old.theta_pi), atol=1e-6
-    )
-    ppo.ship(paths[1], tmp_path / "b.npz", gain=1.25)
-    x = np.random.default_rng(1).standard_normal((3, new.critic_size))
-    louder = ppo.load_policy(tmp_path / "b.npz")[0]
-    inside = np.abs(new.norm(x)) < 8  # the rest is clipped
-    np.testing.assert_allclose(louder.norm(x)[inside], 1.25 * new.norm(x)[inside], rtol=0.01)
-    other = Path(ppo.__file__).parent / "characters" / "jesse-hmd.npz"
-    assert ppo.load_policy(other)[1]["licence"] != "MIT"
-    assert ppo.ship(other, tmp_path / "again.npz")["licence"] == ppo.load_policy(other)[1]["licence"]
-    with pytest.raises(UserError, match="--blend .*: networks .*; valid: policies of one ancestor with "):
-        ppo.ship(paths[1], tmp_path / "c.npz", [other])
-    arrays, meta = load_checkpoint(paths[0] / CHECKPOINT, ("policy.*",))
-    save_checkpoint(tmp_path / "bent.npz", arrays, meta | {"options": meta["options"] | {"set": "pose.spine_y=0.2"}})
-    with pytest.raises(UserError, match="bent.npz: another body or pose"):
-        ppo.ship(paths[1], tmp_path / "c.npz", [tmp_path / "bent.npz"])
-    save_checkpoint(tmp_path / "odd.npz", arrays, meta | {"options": meta["options"] | {"set": 5}})
-    with pytest.raises(UserError, match="odd.npz: its options name no character"):
-        ppo.ship(paths[1], tmp_path / "c.npz", [tmp_path / "odd.npz"])
-    save_checkpoint(tmp_path / "less.npz", arrays, meta | {"options": meta["options"] | {"set": "reward.q=[0, 1]"}})
-    ppo.ship(paths[1], tmp_path / "d.npz", [tmp_path / "less.npz"])  # another reward is the same body
-    with pytest.raises(UserError, match="--blend, --share and --gain are of --ship"):
-        ppo.main(["--blend", str(paths[0]), "--out", str(tmp_path / "never")])
-    assert not (tmp_path / "c.npz").exists() and not (tmp_path / "never").exists()
-
-
-def test_ship(tmp_path, monkeypatch):
-    """A shipped policy acts as the run's does, is small, and carries its data's licence."""
-    folder = tmp_path / "motion"
-    folder.mkdir()
-    (folder / "LICENSE").write_text("Non-commercial.\n")
-    monkeypatch.setattr(data, "sequences", lambda *a, **k: data.builtin_clips()[:1])
-    size = ["--envs", "4", "--horizon", "4", "--steps", "16", "--minibatch", "16"]
-    ppo.main(["--motion", str(folder), "--out", str(tmp_path / "run"), *size])
-    target = tmp_path / "jesse.npz"
-    ppo.main(["--ship", str(target), "--out", str(tmp_path / "run")])
-    (a, _), (b, meta) = ppo.load_policy(tmp_path / "run"), ppo.load_policy(target)
-    obs = np.random.default_rng(0).standard_normal((3, a.obs_size)).astype(np.float32)
-    np.testing.assert_array_equal(a.mean_action(obs), b.mean_action(obs))
-    assert meta["licence"] == "weights trained on motion, licensed: Non-commercial." and meta["steps"] == 16
-    assert target.stat().st_size < 4e6
-    assert str(tmp_path) not in json.dumps(meta)  # no path of the machine
-    ppo.main(["--motion", f"builtin,{folder},standing", "--out", str(tmp_path / "both"), *size])
-    ppo.main(["--motion", str(folder), "--init", str(target), "--out", str(tmp_path / "more"), *size])
-    more = ppo.ship(tmp_path / "more", tmp_path / "more.npz")
-    assert more["steps"] == 32 == ppo.total_steps(ppo.load_policy(tmp_path / "more")[1]) and not more["options"]["init"]
-    assert ppo.ship(tmp_path / "both", target)["licence"] == meta["licence"]
-    assert ppo.load_policy(target)[1]["options"]["motion"] == "builtin,motion,standing"
-    with pytest.raises(UserError):
-        ppo.ship(tmp_path / "nothing", target)

@@ -529,11 +529,13 @@ def test_reference(char, mini, clips):
     ref = retarget.reference(char, clips[:2])
     n = len(clips[0])
     assert ref.names == [c.name for c in clips[:2]] and ref.rate == 30.0 and len(ref) == n + len(clips[1])
+    assert list(ref.still) == [0, 0]
     assert list(ref.first) == [0, n] and list(ref.last) == [n - 1, len(ref) - 1]
     for k, clip in enumerate(clips[:2]):
         part, alone = slice(ref.first[k], ref.last[k] + 1), retarget.reference(char, [clip])
-        for field in dataclasses.fields(ref)[4:]:
+        for field in dataclasses.fields(ref)[4:-1]:
             np.testing.assert_array_equal(getattr(ref, field.name)[part], getattr(alone, field.name))
+        assert ref.still[k] == alone.still[0]
         scale = retarget.root_scale(char, clip.hip_height)
         for t in range(0, len(clip), 29):
             f = ref.first[k] + t

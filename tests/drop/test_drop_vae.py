@@ -355,7 +355,7 @@ def test_training_from_shipped_networks(tmp_path, monkeypatch):
     assert t.updates == longer["updates"]
     other = train.Options(out=str(tmp_path / "c"), init=file, **(longer | {"latent": TINY["latent"] + 1}))
     with pytest.raises(UserError, match=f"--latent {TINY['latent']}"):
-        train(other)
+        train.train(other)
 
 
 def test_linear_baseline():
@@ -554,10 +554,10 @@ def test_command(tmp_path, monkeypatch, capsys):
             run_main(main, [str(a) for a in args])
         return end.value.code, capsys.readouterr()
 
-    code, out = run("--help")
+    code, out = run("train", "--help")
     assert code == 0 and "--rollout" in out.out
     code, out = run("dance")
-    assert code == 2 and out.err.count("\n") == 1 and "valid: train, evaluate" in out.err
+    assert code == 2 and out.err.count("\n") == 1 and "train, evaluate, rollout, ship" in out.err
     assert run()[0] == 2
     small = [w for k, v in TINY.items() for w in (f"--{k}", v)]
     code, out = run("train", "--out", tmp_path / "a", *small)

@@ -1,23 +1,33 @@
 """extras/gpu.py, on the processor: MuJoCo Warp has a CPU device, and NumPy stands where CuPy would."""
 
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 
 import character
+import env as env_module
+import human
 import nn
+import policy
 import ppo
-from env import Disturbance, Env
-from extras import gpu
-from plumbing.cli import UserError, run_main
+import retarget
+from env import Env
+from extras import gpu, train
+from extras.train import Curriculum, Disturbance
+from plumbing.cli import UserError
 from plumbing.runs import load_checkpoint
+from policy import load_policy
 
 pytestmark = pytest.mark.usefixtures("motions_once")
 
 
 def trainer(char, ref, **options):
     opt = ppo.Options(**{"envs": 3, "horizon": 4, "minibatch": 6, "hidden": (16,), "value_hidden": (16,)} | options)
-    return ppo.Trainer(opt, Env(char, ref, opt.envs, seed=1, threads=1))
+    return gpu.Trainer(opt, Env(char, ref, opt.envs, seed=1, threads=1))
 
 
 def needs_warp():
@@ -78,13 +88,14 @@ def test_moved_trainer_sees_the_same(char, ref):
 
 def test_generator_draws_what_the_environment_asks_for(char, ref):
     """Every switch that draws random numbers finds them in the GPU's generator."""
-    env = Env(char, ref, 8, threads=1, balance=True, retry=0.5, stand=0.5, disturbance=Disturbance(0.1, 0.1, 1.0))
+    starts = Curriculum(replace(ref, still=np.full(len(ref.first), 9)), balance=True, retry=0.5, stand=0.5, begin=0.2)
+    env = Env(char, ref, 8, threads=1, starts=starts, disturbance=Disturbance(8, 3, 0.1, 0.1, 1.0))
     env.rng = gpu.Generator(np, 0)
     env.reset()
-    env.lost[:] = ref.first[0] + 20
+    starts.lost[:] = ref.first[0] + 20
     for _ in range(30):
         env.step(env.rng.standard_normal((8, env.action_size), dtype=np.float32))
-    assert env.lost.min() > 0 and env.rng.permutation(5).size == 5
+    assert starts.lost.min() > 0 and env.rng.permutation(5).size == 5
 
 
 def test_swap_ends(char, ref):
@@ -98,25 +109,32 @@ def test_swap_ends(char, ref):
     assert nn.np is np and ppo.np is np
 
 
-def test_wrong_uses(capsys, tmp_path, monkeypatch):
-    """What --gpu cannot do is said in one line."""
-    out = tmp_path / "run"
-    with pytest.raises(SystemExit):
-        run_main(ppo.main, ["--gpu", "--gym", "HalfCheetah-v4", "--out", str(out)])
-    assert "--init" in capsys.readouterr().err and not out.exists()
-    monkeypatch.setitem(__import__("sys").modules, "mujoco_warp", None)
+def test_every_module_of_the_loop_is_swapped(char, ref):
+    """Whatever module computes with arrays in collect and update is named, the curriculum's by where it is defined."""
+    starts = Curriculum(ref, balance=True)
+    t = trainer(char, ref)
+    t.env.parts["starts"] = starts
+    fake = t.env.batch = SimpleNamespace(xp=object())
+    with gpu.arrays_of(t):
+        for module in (env_module, nn, character, human, retarget, policy, ppo, train):
+            assert module.np is fake.xp, module.__name__
+    assert train.np is ppo.np is np
+
+
+def test_missing_packages(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     with pytest.raises(UserError, match="pip install"):
         gpu.Worlds(character.load("jesse").model, 1)
 
 
 def test_checkpoint_is_a_policy(char, ref, tmp_path):
-    """A run on the GPU leaves what --init, --ship and play.py read."""
+    """A run on the GPU leaves what --init, extras/policies.py and play.py read."""
     needs_warp()
-    gone = gpu.moved(trainer(character.load("jesse"), ref, gpu=True), "cpu")
+    gone = gpu.moved(trainer(character.load("jesse"), ref), "cpu")
     with gpu.arrays_of(gone):
         gone.start(), gone.collect(), gone.update()
         gone.save(tmp_path / "checkpoint.npz", {"options": {}})
     arrays, meta = load_checkpoint(tmp_path / "checkpoint.npz", ("policy.*",))
-    policy, _ = ppo.load_policy(tmp_path / "checkpoint.npz")
-    np.testing.assert_array_equal(policy.theta_pi, gone.policy.theta_pi)
+    saved, _ = load_policy(tmp_path / "checkpoint.npz")
+    np.testing.assert_array_equal(saved.theta_pi, gone.policy.theta_pi)
     assert meta["steps"] == 12

@@ -1,6 +1,7 @@
 """Headset streams: columns, axes, losses, calibration, and a character that is driven whatever comes."""
 
 import io
+import json
 import os
 import re
 import sys
@@ -20,7 +21,7 @@ import retarget
 from env import Env, headset_only, observation_terms
 from headset import calibration
 from headset.calibration import Calibration, Resampler, Stream
-from headset.player import Pace, Player, drive
+from headset.player import Pace, Player, drive, ride
 from headset.reader import (
     AXES,
     COLUMNS,
@@ -55,9 +56,10 @@ from human import (
     quat_rotate,
     sensors,
 )
+from mocap.data import load
 from plumbing.cli import UserError, run_main
 from plumbing.runs import save_checkpoint
-from ppo import Policy
+from policy import Policy
 
 ROOT = Path(__file__).resolve().parents[2]
 XYZW = lambda q: np.roll(q, -1, axis=-1)  # noqa: E731
@@ -601,7 +603,7 @@ def test_headset_only(jesse, walk):
         np.testing.assert_allclose(offset, NEUTRAL[1:], atol=1e-9)
         assert quat_angle(a.quat[1:], turn).max() < 1e-6
     player = Player(jesse, lambda obs: np.zeros((1, len(jesse.limits))), devices=1)
-    player.step(a.pos, a.quat)
+    player.step(a.pos[None], a.quat[None])
     assert "hand" not in " ".join(player.report()) and player.obs.shape == (1, 189 - 36)
 
 
@@ -648,7 +650,7 @@ def test_player_observes_as_env(jesse, walk, devices):
         seen = env.full[:, : env.obs_size].copy()
         assert player.obs_size == env.obs_size
         ended = env.step(act(seen))[2]
-        player.step(ref.sensor_pos[10 + k], ref.sensor_quat[10 + k])
+        player.step(ref.sensor_pos[10 + k][None], ref.sensor_quat[10 + k][None])
         assert np.allclose(player.obs, seen, atol=1e-6), k
         if ended[0]:
             break
@@ -657,54 +659,135 @@ def test_player_observes_as_env(jesse, walk, devices):
 
 
 def test_stand(jesse):
-    """Feet on the floor, headset under the user's, turned as the user looks, moving as the headset does."""
+    """Feet on the floor, the root a human's distance behind the headset, turned and moving as it is."""
     player = Player(jesse, lambda obs: np.zeros((1, len(jesse.limits))))
     turn = quat_about(2, 0.8)
-    pos = np.array([[3.0, -1.0, 1.4]] * 3)
-    player.stand(pos, np.tile(turn, (3, 1)))
-    site = player.site_xpos[0, jesse.sensor_sites[0]]
-    assert np.allclose(site[:2], pos[0, :2], atol=1e-9) and np.isclose(site[2], retarget.headset(jesse)[2])
+    pos, quat = np.array([[[3.0, -1.0, 1.4]] * 3]), np.tile(turn, (1, 3, 1))
+    player.stand(pos, quat)
+    behind = pos[0, 0, :2] - retarget.HEADSET_AHEAD[0] * np.array([np.cos(0.8), np.sin(0.8)])
+    assert np.allclose(player.qpos[0, :2], behind, atol=1e-9) and retarget.HEADSET_AHEAD[0] == 0.14
+    assert np.isclose(player.site_xpos[0, jesse.sensor_sites[0], 2], retarget.headset(jesse)[2])
     assert np.isclose(heading(player.qpos[0, 3:7]), 0.8) and not player.qvel.any()
     lowest = character.geom_lowest(jesse.model, jesse.sole_geoms.ravel(), player.geom_xpos, player.geom_xmat).min()
     assert abs(lowest) < 1e-6
-    player.before = (pos[None] - [0.01, 0.02, 0.5], None)
-    player.stand(pos, np.tile(turn, (3, 1)))
+    player.before = (pos - [0.01, 0.02, 0.5], None)
+    player.stand(pos, quat)
     assert np.allclose(player.qvel[0, :3], [0.3, 0.6, 0.0])
+
+
+def test_standing_root_is_where_training_has_it(walk):
+    """A standing human's headset is HEADSET_AHEAD before the hips, to three centimetres."""
+    still = load("standing", clips="stand_005")[0]
+    way = sensors(still)[0][:, 0] - still.pos[:, 0]
+    yaw = heading(still.quat[:, 0])
+    ahead = np.cos(yaw) * way[:, 0] + np.sin(yaw) * way[:, 1]
+    assert np.mean(ahead) == pytest.approx(retarget.HEADSET_AHEAD[0], abs=0.03)
 
 
 def test_away_is_from_the_headset(jesse):
     player = Player(jesse, lambda obs: np.zeros((1, 33)))
-    pos, quat = np.tile([3.0, -1.0, 1.4], (3, 1)), np.tile([1.0, 0, 0, 0], (3, 1))
+    pos, quat = np.tile([3.0, -1.0, 1.4], (1, 3, 1)), np.tile([1.0, 0, 0, 0], (1, 3, 1))
     player.stand(pos, quat)
-    assert player._end(pos - [1.05, 0, 0]) == "away" and player._end(pos + [0.95, 0, 0]) is None
+    assert player._ends(pos - [1.05, 0, 0]) == ["away"] and player._ends(pos + [0.95, 0, 0]) == [None]
 
 
 def test_errors_are_distances(jesse):
     """Of the headset, and the mean of both controllers."""
     player = Player(jesse, lambda obs: np.zeros((1, 33)))
-    pos, quat = np.tile([0.11, 0.0, 1.475], (3, 1)), np.tile([1.0, 0, 0, 0], (3, 1))
+    pos, quat = np.tile([0.11, 0.0, 1.475], (1, 3, 1)), np.tile([1.0, 0, 0, 0], (1, 3, 1))
     player.stand(pos, quat)
-    player.before = (pos[None], quat_matrix(quat)[None, ..., :2])
-    sites = player.site_xpos[0, jesse.sensor_sites] + [[0.01, 0, 0], [0, 0.02, 0], [0, 0, 0.06]]
+    player.before = (pos, quat_matrix(quat)[..., :2])
+    sites = player.site_xpos[:, jesse.sensor_sites] + [[0.01, 0, 0], [0, 0.02, 0], [0, 0, 0.06]]
     player.step(sites, quat)
-    assert player.head_error == pytest.approx(0.01) and player.hand_error == pytest.approx(0.04)
+    assert player.head_error[0] == pytest.approx(0.01) and player.hand_error[0] == pytest.approx(0.04)
 
 
 def test_falls_are_counted(jesse):
     """All torques at their limit: it falls and stands again; away from the user it is put back; NaN is no end."""
-    still = np.tile([[0.11, 0.0, 1.475]], (3, 1)), np.tile([1.0, 0, 0, 0], (3, 1))
+    still = np.tile([[0.11, 0.0, 1.475]], (1, 3, 1)), np.tile([1.0, 0, 0, 0], (1, 3, 1))
     player = Player(jesse, lambda obs: np.ones((1, len(jesse.limits))))
     for _ in range(90):
         player.step(*still)
-    assert player.ends["fall"] >= 1 and np.isfinite(player.qpos).all()
+    assert player.ends[0]["fall"] >= 1 and np.isfinite(player.qpos).all()
     assert "falls" in player.report()[0] and "head error" in player.report()[1] and "p99" in player.report()[2]
     player.stand(*still)
-    before = player.ends["away"]
-    assert player.step(still[0] + [3.0, 0, 0], still[1]) == "away" and player.ends["away"] == before + 1
+    before = player.ends[0]["away"]
+    assert player.step(still[0] + [3.0, 0, 0], still[1]) == ["away"] and player.ends[0]["away"] == before + 1
     assert np.linalg.norm(player.qpos[0, :2] - [3.0, 0]) < 0.2
     broken = Player(jesse, lambda obs: np.full((1, len(jesse.limits)), np.nan))
-    assert [broken.step(*still) for _ in range(3)] == ["bad"] * 3 and np.isfinite(broken.qpos).all()
+    assert [broken.step(*still) for _ in range(3)] == [["bad"]] * 3 and np.isfinite(broken.qpos).all()
     assert Player(jesse, None).report() == ["0 s played"]
+
+
+def test_side_by_side(jesse, walk):
+    """Streams of several lengths: each character does what it does alone; only ticks of its own stream count."""
+    ref = retarget.reference(jesse, [walk])
+    act = lambda obs: 0.3 * np.sin(np.arange(len(jesse.limits)) + 5 * obs[:, :1])  # noqa: E731
+    whole = ref.sensor_pos[:70], ref.sensor_quat[:70]
+    streams = [whole, (whole[0][5:45] + [0.5, 0, 0], whole[1][5:45]), whole]
+    rides = ride(jesse, act, streams)
+    for stream, found in zip(streams, rides):
+        [alone] = ride(jesse, act, [stream], threads=1)
+        assert np.allclose(found.qpos, alone.qpos, atol=1e-9) and found.ends == alone.ends
+        assert np.array_equal(found.anew, alone.anew) and np.array_equal(found.contact, alone.contact)
+        assert found.head == pytest.approx(alone.head) and found.hands == pytest.approx(alone.hands)
+        assert len(found.qpos) == len(stream[0]) and found.anew.sum() in (found.failures, found.failures + 1)
+    assert rides[0].failures > 0 and rides[0].anew[0]  # it falls, and the start counts as a stand, not as a failure
+    # the contacts of a tick are those of the step before it, as Env sees them
+    env = Env(jesse, ref, 1, threads=1, autoreset=False)
+    player = Player(jesse, act)
+    player.stand(ref.sensor_pos[:1], ref.sensor_quat[:1])
+    env.reset(frames=[0])
+    env.qpos[:], env.qvel[:] = player.qpos, player.qvel
+    env.refresh()
+    seen = 0
+    for k in range(12):
+        player.step(ref.sensor_pos[[k]], ref.sensor_quat[[k]])
+        env.step(player.ctrl.copy())
+        assert np.array_equal(player.contact, env.contact)
+        seen += player.contact.sum()
+    assert seen
+
+
+def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
+    """A line a file and a JSON; the same numbers as alone; what is no recording is named, and the exit says so."""
+    pos, quat = sensors(walk)
+    parts = ("px", "py", "pz", "qx", "qy", "qz", "qw")
+    names = ["time", *(f"{d}_{p}" for d in ("head", "left", "right") for p in parts)]
+    rows = np.concatenate([pos, np.roll(quat, -1, axis=-1)], axis=-1).reshape(len(pos), -1)
+    rows = np.concatenate([np.arange(len(pos))[:, None] / walk.rate, rows], axis=1)
+    (tmp_path / "sub").mkdir()
+    for name, n in (("a.csv", len(rows)), ("sub/b.csv", len(rows) // 2)):
+        np.savetxt(tmp_path / name, rows[:n], delimiter=",", header=",".join(names), comments="", fmt="%.9g")
+    common = ["--character", "jesse", "--axes", "mujoco"]
+
+    def played(path, *more):
+        with pytest.raises(SystemExit) as end:
+            run_main(play.main, [*common, "--stream", str(path), "--json", str(tmp_path / "o.json"), *more])
+        return end.value.code, json.loads((tmp_path / "o.json").read_text())
+
+    code, found = played(tmp_path)
+    assert code == 0 and set(found["files"]) == {"a.csv", "sub/b.csv"} and set(found["all"]) == set(play.OF_FILE)
+    out = capsys.readouterr().out.splitlines()
+    assert out[0].startswith("a.csv: ") and out[2].startswith("all 2, completed ")
+    for name, row in found["files"].items():
+        assert set(row) == set(play.OF_FILE) and row["completed"] == (row["failures"] == 0)
+        code, alone = played(tmp_path / name)
+        [same] = alone["files"].values()
+        assert same == pytest.approx(row, rel=1e-4) and code == 0
+    total = found["all"]
+    assert total["seconds"] == pytest.approx(sum(r["seconds"] for r in found["files"].values()), abs=0.01)
+    assert total["failures"] == sum(r["failures"] for r in found["files"].values())
+    assert total["completed"] == np.mean([r["completed"] for r in found["files"].values()])
+    (tmp_path / "broken.csv").write_text("time,head_px\n0,1\n")
+    code, found = played(tmp_path)
+    assert code == 1 and len(found["files"]) == 2 and "broken.csv, line 1: no column" in capsys.readouterr().out
+    _, short = played(tmp_path / "a.csv", "--seconds", "1")
+    assert short["all"]["seconds"] == 1.0
+    (tmp_path / "none").mkdir()
+    with pytest.raises(SystemExit):
+        run_main(play.main, [*common, "--stream", str(tmp_path / "none")])
+    assert "a folder without recordings" in capsys.readouterr().err
 
 
 def wreck(samples, rng):

@@ -488,18 +488,3 @@ def test_outline():
 def test_missing_file_names_itself(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere.bvh"):
         bvh.read(tmp_path / "nowhere.bvh")
-
-
-# ---------------------------------------------------------------- command line
-
-
-def test_main(tmp_path, capsys):
-    good, bad = tmp_path / "good.bvh", tmp_path / "bad.bvh"
-    good.write_text(SMALL)
-    bad.write_text("x")
-    assert bvh.main([str(good), "--joints"]) == 0
-    out = capsys.readouterr().out
-    assert "2 joints, 9 channels, 2 frames, 25 Hz, 0.08 s" in out and "Knee: parent Hips" in out
-    assert bvh.main([str(bad), str(tmp_path / "none.bvh"), str(good)]) == 1
-    said = capsys.readouterr()
-    assert len(said.err.splitlines()) == 2 and "good.bvh" in said.out

@@ -735,9 +735,9 @@ def test_load_errors(tmp_path, quick_builtin):
     assert "no such file or folder" in (m := message(tmp_path / "nowhere")) and "builtin" in m and "nowhere" in m
     assert "a folder without motion; valid: one that holds .bvh" in message(tmp_path)
     assert all(s in message("builtin", split="test") for s in ("'test'", *data.SPLITS))
-    assert "'*fly*'" in (m := message("builtin", clips="*fly*")) and "walk_005" in m and "(20)" in m
-    m = message("builtin", clips="*jog*", split="validation")
-    assert "'*jog*'" in m and "'validation'" in m and "train" in m
+    assert "'*fly*'" in (m := message("builtin", clips="*fly*")) and "walk_005" in m and "(30)" in m
+    m = message("builtin", clips="*jog*", split="style")
+    assert "'*jog*'" in m and "'style'" in m and "train" in m
     write_as(tmp_path / "walk_001.bvh", "bandai", still(2))
     (tmp_path / "a.bvh").mkdir()  # a folder is searched, whatever its name
     (tmp_path / "UPPER.BVH").write_text((tmp_path / "walk_001.bvh").read_text())  # other systems' spelling
@@ -759,7 +759,7 @@ def test_joined(tmp_path, capsys):
     assert [c.name for c in data.load(own)] == ["walk,turn_001"]
     both = data.load(f"builtin,standing,{tmp_path}", split="validation")
     alone = [c for s in ("builtin", "standing", tmp_path) for c in data.load(s, split="validation")]
-    assert len(alone) == 5 and all(a.name == b.name and np.array_equal(a.pos, b.pos) for a, b in zip(both, alone))
+    assert len(alone) == 25 and all(a.name == b.name and np.array_equal(a.pos, b.pos) for a, b in zip(both, alone))
     kinds = {c.name.split("_")[0] for c in data.load("standing")}
     assert kinds == {"stand", "gesture", "sidestep", "start", "stop"}
     capsys.readouterr()
@@ -798,10 +798,10 @@ def test_builtin(library):
             getattr(x, k).tobytes() == getattr(y, k).tobytes() for k in ("pos", "quat", "ball")
         )
     assert a[0].pos.tobytes() != c[0].pos.tobytes()
-    assert sum(x.seconds for x in a) == pytest.approx(600, abs=0.1)
+    assert sum(x.seconds for x in a) == pytest.approx(900, abs=0.1)
     assert len({x.body for x in a}) == len({x.name for x in a}) == len(a)
-    kinds = {x.name.split("_")[0] for x in a}
-    assert kinds == set(gait.KINDS)
+    for split in ("train", "validation"):  # starts, stops, turns and sidesteps are held out, too
+        assert {x.name.split("_")[0] for x in a if data.split_of(x.name) == split} == set(gait.KINDS)
     for x in a:
         body = gait.body_of({"pos": x.pos})
         down, lowest = contacts(x), []
@@ -1048,3 +1048,65 @@ def test_augment():
     assert max(fast) < 1.02 * augment.FASTEST and min(fast) < 0.95 * augment.FASTEST
     plain = augment.augment(clips, np.random.default_rng(3), 0, 0, 0, (1, 1), (1, 1), 0)
     assert_same(plain[2], augment.mirror(clips[0]))
+
+
+# ------------------------------------------------------------------------------------ standing before and after
+
+
+def test_planted():
+    """Share 0 changes nothing; share 1 stands: feet level below the hips, knees forward, bones as long as before."""
+    clip = walk(3.0)
+    same = augment.planted(clip, np.zeros(len(clip)))
+    np.testing.assert_allclose(same.pos, clip.pos, atol=1e-9)
+    np.testing.assert_allclose(same.ball, clip.ball, atol=1e-9)
+    stands = augment.planted(clip, np.ones(len(clip)))
+    low = np.percentile(clip.pos[:, FEET, 2], 5, axis=0)
+    for k, side in enumerate("lr"):
+        hip, foot = stands.pos[:, SEG[f"thigh_{side}"]], stands.pos[:, FEET[k]]
+        np.testing.assert_allclose(foot[:, :2], hip[:, :2], atol=0.01)
+        assert np.abs(foot[:, 2] - low[k]).max() < 0.03
+        local = quat_mul(quat_conj(stands.quat[:, SEG[f"thigh_{side}"]]), stands.quat[:, SEG[f"shin_{side}"]])
+        assert rot(local).as_euler("YXZ")[:, 0].min() > -0.02
+    for a, b in (("thigh_l", "shin_l"), ("shin_l", "foot_l"), ("thigh_r", "shin_r"), ("shin_r", "foot_r")):
+        before, after = (np.linalg.norm(c.pos[:, SEG[a]] - c.pos[:, SEG[b]], axis=-1) for c in (clip, stands))
+        np.testing.assert_allclose(after, before, atol=1e-9)
+    arms = [SEG[s] for s in ("pelvis", "chest", "head", "hand_l", "hand_r")]
+    np.testing.assert_array_equal(stands.pos[:, arms], clip.pos[:, arms])
+
+
+def test_lead():
+    """Still, then time speeds up: the devices' poses are those of the clip at the integral of its speed."""
+    clip = walk(4.0)
+    led = augment.lead(clip, 1.5, 1.5)
+    pos, own = sensors(led)[0], sensors(clip)[0]
+    assert led.still == 46 and led.measured == pytest.approx(own[0, 0, 2])
+    np.testing.assert_allclose(pos[:46], np.tile(own[:1], (46, 1, 1)), atol=1e-9)
+    for k in range(1, 46):  # k / 30 s after it sets off: tau = t² / (2 · 1.5 s)
+        tau = (k / 30) ** 2 / 3.0 * 30
+        i = int(tau)
+        np.testing.assert_allclose(pos[45 + k], own[i] + (tau - i) * (own[i + 1] - own[i]), atol=1e-5)
+    speed = np.linalg.norm(np.diff(pos[:, 0], axis=0), axis=-1) * 30
+    assert speed[45] < 0.1 and speed[100:].mean() > 0.8
+    assert len(led) == 46 + 45 + int(len(clip) - 1 - 22.5)
+    both = augment.lead(clip, 1.0, 1.0, 1.0)
+    np.testing.assert_allclose(sensors(both)[0][-30:], np.tile(own[-1:], (30, 1, 1)), atol=1e-9)
+    assert contacts(both)[-20:].all() and contacts(both)[:20].all()  # who stands has both feet on the floor
+    short = augment.lead(clip[:20], 0.5, 1.5, 0.5)
+    assert np.isfinite(short.pos).all() and len(short) > 20
+    assert augment.begins_in_motion(clip) and not augment.begins_in_motion(led)
+    assert led[10:].still == 36 and led[60:].still == 0
+
+
+def test_visits():
+    """Two visits a clip, by two people; each begins and ends still; long clips come in parts; the seed decides."""
+    clips = [walk(4.0), walk(20.0)]
+    found = augment.visits(clips, np.random.default_rng(0))
+    assert len(found) == 2 * (1 + 1) and all(c.name.endswith("-visit") for c in found)
+    for c in found:
+        p = sensors(c)[0][:, 0]
+        assert c.still >= 19 and np.ptp(p[: c.still], axis=0).max() < 1e-9 and np.ptp(p[-15:], axis=0).max() < 1e-9
+        assert 0.9 < c.measured / p[0, 2] < 1.1 and c.seconds < augment.LONGEST + 6.0
+    assert len({c.body for c in found}) > 2
+    again = augment.visits(clips, np.random.default_rng(0))
+    assert all(np.array_equal(a.pos, b.pos) and a.measured == b.measured for a, b in zip(found, again, strict=True))
+    assert augment.visits([], np.random.default_rng(0)) == []

@@ -375,7 +375,7 @@ def test_latest_falls_back(tmp_path, capsys):
 
 
 WRITER = """
-import sys, numpy as np, runs
+import sys, numpy as np, plumbing.runs
 step = int(sys.argv[2])
 while True:
     step += 1

@@ -54,8 +54,9 @@ from human import sensors
 from mocap import inspect, rigs
 from mocap.data import load
 from mocap.rigs import Reading
-from plumbing import runs
+from plumbing import runs, training
 from plumbing.cli import MESSAGE, UserError
+from policy import Policy, load_policy
 
 resource = pytest.importorskip("resource", reason="this system cannot limit a process's memory")
 
@@ -571,7 +572,7 @@ def check_policy(policy):
 
 @pytest.fixture(scope="module")
 def policy_file():
-    policy = ppo.Policy(5, 7, 2, (4,), (3, 2), 0.1, 1.0, np.random.default_rng(0))
+    policy = Policy(5, 7, 2, (4,), (3, 2), 0.1, 1.0, np.random.default_rng(0))
     policy.norm.update(np.random.default_rng(0).normal(size=(4, 7)))
     return npz_bytes(policy.arrays(), {"policy": policy.shape(), "steps": 5, "options": {"motion": "builtin"}})
 
@@ -600,7 +601,7 @@ def resuming(trainer):
 
     def read(folder):
         runs.check_run(folder, resume=True)
-        opt = ppo.resumed_options(ppo.Options(out=str(folder), resume=True), ["--resume"])
+        opt = training.resumed_options(ppo.Options(out=str(folder), resume=True), ["--resume"])
         for f in fields(opt):
             kinds = {type(f.default), type(None)} | ({int} if type(f.default) is float else set())
             assert f.default is None or type(getattr(opt, f.name)) in kinds, f.name
@@ -664,7 +665,7 @@ def readers(jesse, bvh_files, cmu_files, policy_file, trainer, run_files, csv_fi
     deep_bvh = lambda raw: damaged(raw, inserting(chain(50)))  # noqa: E731
     deep_xml = lambda raw: damaged(raw, inserting(b'<body name="b">' * 1000))  # noqa: E731
     take = {axes: {"take.csv": raw, "axes": axes.encode()} for axes, raw in csv_files.items()}
-    load_policy = lambda folder: check_policy(ppo.load_policy(folder / "p.npz")[0])  # noqa: E731
+    read_policy = lambda folder: check_policy(load_policy(folder / "p.npz")[0])  # noqa: E731
     resumed = {"config.json": lambda raw: json_damage(json.loads(raw)), "metrics.csv": damaged}
     return {
         "bvh": ([{"take.bvh": raw} for raw in bvh_files.values()], reading_motion(jesse, "take.bvh"),
@@ -674,7 +675,7 @@ def readers(jesse, bvh_files, cmu_files, policy_file, trainer, run_files, csv_fi
                 reading_motion(jesse, "take.bvh", "map.toml"), text("map.toml")),
         "toml": ([MINI], read_character, text("mini.toml")),
         "xml": ([MINI], read_character, {"mini.xml": deep_xml}),
-        "policy": ([{"p.npz": policy_file}], load_policy, {"p.npz": npz_damage}),
+        "policy": ([{"p.npz": policy_file}], read_policy, {"p.npz": npz_damage}),
         "run": ([run_files], resuming(trainer), resumed | {"checkpoint.npz": npz_damage}),
         "stream": (list(take.values()), playing(jesse, live=False), text("take.csv")),
         "stdin": ([take["unity"]], playing(jesse, live=True), text("take.csv")),

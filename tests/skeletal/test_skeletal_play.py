@@ -232,8 +232,7 @@ def test_families_are_unpaired(monkeypatch):
     """No clip is on two characters; the first character is the actor."""
     monkeypatch.setattr(motions, "load", lambda *a, **k: CLIPS[:2])
     seen = []
-    truth = data.truth
-    monkeypatch.setattr(data, "truth", lambda m, c: seen.append(m.name) or truth(m, c))
+    monkeypatch.setattr(train, "truth", lambda m, c: seen.append(m.name) or data.truth(m, c))
     a, b = train.families(train.TrainOptions(characters=1))
     assert len(a.arrays) == len(b.arrays) == 2 and len(seen) == 1  # one clip each, both ways in time
     assert len(b.names) == len(data.derive(a.characters[0]).names)

@@ -1,0 +1,358 @@
+r"""Policies made of policies: shipped, averaged, carried over to another body.
+
+    python -m extras.policies ship RUN OUT.npz                         the policy of a run, with its data's licence
+    python -m extras.policies blend OUT.npz A B … --share 0.3          A's weights averaged with those of the others
+    python -m extras.policies carry OLD.npz NEW.npz --character dino   to go on with as another character, another
+                                                                       variation, with other sensors or wider layers
+
+`carry` keeps what both have names for, and what an action did: where the limit or the spring of a joint has changed,
+the same torque is asked for.  `ppo.py --init NEW.npz` then goes on from it.
+
+[Wortsman22]  Wortsman et al., Model soups: averaging weights of multiple fine-tuned models, ICML 2022
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+import character
+from character import Character
+from env import SENSORS, WITHOUT, observation_terms
+from mocap import data
+from nn import MLP, RunningNorm
+from plumbing.cli import ALL_POSITIVE, POSITIVE, UNIT, UserError, arg, cli, given_flags, run_main
+from plumbing.files import check_folders
+from plumbing.runs import fmt_count, git_state, save_checkpoint, versions
+from policy import Policy, load_policy, sensors_of, total_steps, trained_as
+
+SIGMA = 0.135  # exploration noise of a policy that goes on as another character, where that one's recipe has none
+
+# ------------------------------------------------------------------------------------ ship, blend
+
+
+def blended(policy: Policy, others: list[Policy], share: float) -> Policy:
+    r"""A policy's weights averaged with those of its ancestor, or of others that were fine-tuned from the same one.
+
+    Equation  theta = (1 - s) theta + s mean(theta'), and so the normaliser's means and variances  [Wortsman22, "model
+              soups"]; the critic stays as it is if one of the others was trained with another reward
+    Why       what was learnt lately on some motions and what was known before on others are both kept: such policies
+              lie in one valley, and its middle is lower than its slopes (measured)
+    Args      share : s, of the others together
+    Returns   policy, changed
+    Raises    ValueError: networks of other sizes
+    Test      tests/extras/test_policies.py::test_blended
+    """
+    own = policy.shape()
+    for other in others:
+        if other.shape() | {"value_scale": own["value_scale"]} != own:
+            raise ValueError(f"networks {other.shape()}, expected {own}")
+
+    def mix(get):
+        rest = np.mean([get(p).astype(float) for p in others], axis=0)
+        return (1.0 - share) * get(policy) + share * rest
+
+    policy.theta_pi[:] = mix(lambda p: p.theta_pi)
+    if all(p.value_scale == policy.value_scale for p in others):
+        policy.critic.theta[:] = mix(lambda p: p.critic.theta)
+    mean, var, count = mix(lambda p: p.norm.mean64), mix(lambda p: p.norm.var), policy.norm.count
+    policy.norm.load_state({"count": np.array(count), "mean": mean, "m2": var * count})
+    return policy
+
+
+def _body(meta, path) -> tuple:
+    """Which body a policy was trained with: the character and its variation, rewards left out; () of none named."""
+    own = trained_as(meta, path)
+    if own is None:
+        return ()
+    changes = {c.strip() for c in (own.set or "").split(";")}
+    body = sorted(c for c in changes if c and not c.startswith("reward"))
+    return Path(own.character).stem, own.tail, own.scale, *body
+
+
+def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
+    """Write a run's policy for others to play: weights, normaliser, how it was trained, its data's licence.
+
+    Args      blend : policies to average it with (`blended`), share : of them together
+              gain : the normaliser's deviations are divided by it.  Averaging shrinks weights where policies differ,
+              and with them the answer to a deviation; a gain of some per cent gives it back (measured)
+    Returns   what was written beside the weights
+    Raises    UserError: the run has no checkpoint, a policy does not fit, or the path cannot be written
+    Test      tests/extras/test_policies.py::test_ship, test_blended
+    """
+    policy, meta = load_policy(run)
+    loaded = [load_policy(p) for p in blend]
+    try:
+        own = _body(meta, run)
+        if odd := [str(p) for p, (_, m) in zip(blend, loaded, strict=True) if _body(m, p) != own]:
+            raise ValueError(f"{', '.join(odd)}: another body or pose than {own}")
+        policy = blended(policy, [p for p, _ in loaded], share) if blend else policy
+    except ValueError as e:
+        raise UserError(f"blend {run} {' '.join(map(str, blend))}: {e}; valid: policies of one ancestor") from None
+    try:
+        motion, _, _, _ = str(meta["options"]["motion"]), meta["options"]["init"], meta["steps"], meta["data"]
+    except (KeyError, TypeError) as e:
+        raise UserError(f"{run}: does not say how it was trained ({e}); valid: a folder that ppo.py wrote") from None
+    sets = data.parts(motion)
+    licences = [f"weights trained on {text}" for text in data.licences(sets)]
+    if "licence" in meta:  # was shipped before
+        licences = [str(meta["licence"])] if meta["licence"] != "MIT" else []
+    kept = {"policy": meta["policy"], "steps": total_steps(meta), "data": meta["data"]}
+    kept["options"] = meta["options"] | {"motion": ",".join(Path(s).name for s in sets), "out": None, "init": None}
+    policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})
+    kept |= {"gain": gain} if gain != 1.0 else {}
+    if blend:
+        kept["blend"] = {"with": [Path(p).name for p in blend], "share": share}
+        older = {str(m["licence"]) for _, m in loaded if m.get("licence", "MIT") != "MIT"}
+        licences += sorted(older - set(licences))
+    kept |= {"licence": "; ".join(licences) or "MIT", "versions": versions(), "git": git_state()}
+    save_checkpoint(path, policy.arrays(), kept)
+    return kept
+
+
+# ------------------------------------------------------------------------------------ carry
+
+
+def input_names(char: Character, devices=3, asymmetric=True) -> list[str]:
+    """A name for every number of the observation, in its order: q.knee_l_y, x.head.2, user.h.R0, human_pos.17, ….
+
+    What two characters, or one with and without controllers, have names for in common, one's policy knows of the other.
+    Args      as of `observation_terms`
+    Test      tests/extras/test_policies.py::test_input_names"""
+    links = [char.model.body(b).name for b in char.obs_links]
+    user = [f"{d}.{i}" for d in "hlr"[:devices] for i in "xyz"]
+    user += [f"{d}.R{i}" for d in "hlr"[:devices] for i in range(6)]
+    own = dict(
+        q=char.hinges,
+        qd=["vx", "vy", "vz", "wx", "wy", "wz", *char.hinges],
+        x=[f"{link}.{i}" for link in links for i in "xyz"],
+        R=[f"{link}.R{i}" for link in links for i in range(6)],
+        user_previous=user,
+        user=user,
+    )
+    terms = observation_terms(char, devices, asymmetric)
+    return [f"{t}.{i}" for t, n in (terms["actor"] | terms["critic"]).items() for i in own.get(t, range(n))]
+
+
+def widened(mlp, sizes, rng):
+    r"""The same function by a network of more units a layer.
+
+    Method    old weights in the upper left corner; a new unit's incoming weights are drawn as `MLP` draws them, its
+              outgoing weights to old units and outputs are 0, so that it is silent until it is trained
+    Source    the idea of function-preserving transformations: Chen et al. 2016, "Net2Net"
+    Args      mlp : MLP; sizes : as many as mlp.sizes, the same inputs and outputs, none smaller; rng : Generator
+    Returns   MLP of the dtype of mlp
+    Raises    ValueError: other inputs or outputs, other depth, or a smaller layer
+    Test      tests/extras/test_policies.py::test_widened_is_the_same_function
+    """
+    old, new = mlp.sizes, tuple(int(n) for n in sizes)
+    same = len(old) == len(new) and old[0] == new[0] and old[-1] == new[-1]
+    if not same or any(b < a for a, b in zip(old, new, strict=True)):
+        raise ValueError(f"sizes are {new}, expected {len(old)} from {old[0]} to {old[-1]} and none below {old}")
+    out = MLP(new, mlp.activation, rng, dtype=mlp.theta.dtype)
+    for i in range(out.n_layers):
+        rows, columns = old[i], old[i + 1]
+        out.params[f"W{i}"][:rows, :columns] = mlp.params[f"W{i}"]
+        out.params[f"W{i}"][rows:, :columns] = 0.0
+        out.params[f"b{i}"][:columns] = mlp.params[f"b{i}"]
+    return out
+
+
+def rearranged(policy: Policy, inputs, obs_size, outputs) -> Policy:
+    """The same policy with other inputs and outputs: one left out is as if it stayed at its mean, a new one is ignored,
+    a new action is 0.
+
+    Args      inputs : (critic,) which of this policy's inputs each is, -1 for a new one, the actor's first;
+              obs_size : how many the actor has; outputs : (u,) the same of the actions
+    Test      tests/extras/test_policies.py::test_headset_only, test_another_character"""
+    inputs, outputs = np.asarray(inputs), np.asarray(outputs)
+    sizes = obs_size, len(inputs), len(outputs), policy.hidden, policy.value_hidden
+    rng, dtype = np.random.default_rng(0), policy.theta_pi.dtype
+    out = Policy(*sizes, 1.0, policy.value_scale, rng, dtype, policy.activation)
+    for mine, its, rows in ((policy.actor, out.actor, inputs[:obs_size]), (policy.critic, out.critic, inputs)):
+        last = mine.n_layers - 1
+        for name, value in mine.params.items():
+            if name == "W0":
+                value = value[rows] * (rows >= 0)[:, None]
+            if its is out.actor and name in (f"W{last}", f"b{last}"):
+                value = value[..., outputs] * (outputs >= 0)
+            its.params[name][:] = value
+    out.log_std[:] = np.where(outputs >= 0, policy.log_std[outputs], policy.log_std.mean())
+    state = {k: v if k == "count" else v[inputs] for k, v in policy.norm.state().items()}
+    state["mean"] = np.where(inputs >= 0, state["mean"], 0.0)
+    state["m2"] = np.where(inputs >= 0, state["m2"], float(state["count"]))
+    out.norm.load_state(state)
+    return out
+
+
+def with_layers(policy: Policy, hidden, value_hidden, path) -> Policy:
+    """The same function by wider layers.  UserError, naming path: another depth, or a narrower layer
+
+    Test      tests/extras/test_policies.py::test_wider_layers"""
+    sizes = policy.obs_size, policy.critic_size, policy.action_size, hidden, value_hidden
+    rng, dtype = np.random.default_rng(0), policy.theta_pi.dtype
+    out = Policy(*sizes, 1.0, policy.value_scale, rng, dtype, policy.activation)
+    try:
+        out.actor.theta[:] = widened(policy.actor, out.actor.sizes, rng).theta
+        out.critic.theta[:] = widened(policy.critic, out.critic.sizes, rng).theta
+    except ValueError:
+        has = f"its layers are {policy.hidden} and {policy.value_hidden}"
+        raise UserError(f"{path}: {has}: give --hidden and --value-hidden as many, none smaller") from None
+    out.log_std[:] = policy.log_std
+    out.norm.load_state(policy.norm.state())
+    return out
+
+
+def with_limits(policy: Policy, old: Character, new: Character) -> Policy:
+    r"""The same torques from a body with other limits and springs, at the default pose.
+
+    Equation  a_new = (a_old L_old + k_old (r_old − q) − k_new (r_new − q)) / L_new,  q the default pose: W and b of the
+              last layer × L_old / L_new, b + the rest, log σ + log (L_old / L_new)
+    Symbols   L limit, k stiffness, r the spring's angle of rest, of each hinge that both drive; all of them divided by
+              size⁴, with which they grow (`character.load`), so that a body of another size does what this one did
+    Args      policy : its outputs are new's motors already
+    Returns   policy, changed
+    Test      tests/extras/test_policies.py::test_another_body"""
+    last = policy.actor.n_layers - 1
+    weights, bias = (policy.actor.params[f"{name}{last}"] for name in "Wb")
+    sizes = [c.variant.get("scale", 1.0) ** 4 for c in (old, new)]
+    driven = [{c.hinges[h]: k for k, h in enumerate(c.driven)} for c in (old, new)]
+    for name in driven[0].keys() & driven[1].keys():
+        limits, pulls = [], []
+        for c, own, size in zip((old, new), driven, sizes, strict=True):
+            h = c.driven[own[name]]
+            limits.append(c.limits[own[name]] / size)
+            pulls.append(c.model.jnt_stiffness[1 + h] * (c.model.qpos_spring[7 + h] - c.default[h]) / size)
+        k, ratio = driven[1][name], limits[0] / limits[1]
+        weights[:, k] *= ratio
+        bias[k] = bias[k] * ratio + (pulls[0] - pulls[1]) / limits[1]
+        policy.log_std[k] += np.log(ratio)
+    return policy
+
+
+def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, dict]:
+    """A policy as that of another body, and what its file says.
+
+    What only one of the two has a name for is silent.  Another character's policy keeps its actions, whatever they are
+    in newton metres, because its mass is another; its normaliser and σ begin anew, because its sizes are others.
+    Args      old, new : characters; opt.sensors, opt.without, opt.hidden, opt.value_hidden : of the new one
+    Raises    UserError: it does not fit old; it knows the headset alone and the new one has controllers
+    Test      tests/extras/test_policies.py::test_headset_only, test_another_character, test_a_variation
+    """
+    policy, meta = load_policy(path)
+    trained = sensors_of(meta, path)
+    sensors = opt.sensors or trained
+    if trained == "hmd" and sensors == "full":
+        raise UserError(f"{path}: was trained with the headset alone: give --sensors hmd")
+    asymmetric = policy.critic_size > policy.obs_size
+    sees = asymmetric and "asymmetric" not in opt.without
+    ways = [(old, 3 if trained == "full" else 1, asymmetric), (new, 3 if sensors == "full" else 1, sees)]
+    have, need = (input_names(*way) for way in ways)
+    outputs, wanted = ([c.hinges[h] for h in c.driven] for c in (old, new))
+    if (len(have), len(outputs)) != (policy.critic_size, policy.action_size):
+        sizes = f"has {policy.critic_size} inputs and {policy.action_size} actions"
+        body = f"{old.path} has {len(have)} and {len(outputs)}"
+        raise UserError(f"{path}: {sizes}, {body}: give the body it was trained with as --from-character PATH")
+    place = lambda names, name: names.index(name) if name in names else -1  # noqa: E731
+    inputs, motors = [place(have, n) for n in need], [place(outputs, n) for n in wanted]
+    actor = sum(observation_terms(new, ways[1][1], sees)["actor"].values())
+    policy = rearranged(policy, inputs, actor, motors)
+    if old.name == new.name:
+        policy = with_limits(policy, old, new)
+    else:
+        policy.norm.load_state(RunningNorm(policy.critic_size).state())
+        policy.log_std[:] = np.log(new.training.get("sigma", SIGMA))
+    policy = with_layers(policy, opt.hidden or policy.hidden, opt.value_hidden or policy.value_hidden, path)
+    known = sum(i >= 0 for i in inputs), sum(i >= 0 for i in motors)
+    print(
+        f"{path}: {old.name}'s policy: {known[0]} of {len(inputs)} inputs and {known[1]} of {len(motors)} torques of "
+        f"{new.name} have the same names and go on"
+    )
+    options = meta.get("options", {}) | {"sensors": sensors, "without": list(opt.without)}
+    options |= {"hidden": list(policy.hidden), "value_hidden": list(policy.value_hidden), "init": None, "out": None}
+    kept = {k: meta[k] for k in ("data", "licence", "blend", "gain") if k in meta}
+    kept |= {"policy": policy.shape(), "options": options, "steps": total_steps(meta), "carried": Path(path).name}
+    return policy, kept | {"versions": versions(), "git": git_state()}
+
+
+# ------------------------------------------------------------------------------------ command line
+
+
+@dataclass
+class Blend:
+    """What `ship` and `blend` can be told."""
+
+    share: float = arg(0.5, "of the others together in the average", check=UNIT)
+    gain: float = arg(1.0, "makes the policy's standardised observations so many times as large", check=POSITIVE)
+
+
+@dataclass
+class Carry(character.Switches):
+    """What `carry` can be told: the new body, by default the old one."""
+
+    character: str | None = arg(None, "name in characters/, or path of a .toml; the policy's own by default")
+    from_character: str | None = arg(None, ".toml of the body that it was trained with; its own by default")
+    sensors: str | None = arg(None, "what it will see of the user: full, or hmd, the headset alone", choices=SENSORS)
+    without: tuple[str, ...] = arg(
+        (),
+        "asymmetric: its critic will see no more than its actor [§5.3]",
+        check=(lambda v: set(v) <= set(WITHOUT), f"one or several of {', '.join(WITHOUT)}"),
+    )
+    hidden: tuple[int, ...] | None = arg(None, "hidden layers of the policy, none narrower", check=ALL_POSITIVE)
+    value_hidden: tuple[int, ...] | None = arg(None, "hidden layers of the value network", check=ALL_POSITIVE)
+
+
+def carry(old_path, new_path, opt: Carry, given=()) -> dict:
+    """Write a policy as that of another body.  -> what its file says
+
+    Args      given : names of the flags that were given: the policy's own variation holds for the others
+    Raises    UserError: the file names no character; as `carried`
+    Test      tests/extras/test_policies.py::test_carry_command"""
+    _, meta = load_policy(old_path)
+    own = trained_as(meta, old_path)
+    if own is None:
+        raise UserError(f"{old_path}: does not say of which character it is; valid: what ppo.py wrote")
+    base = own if opt.character in (None, own.character) else character.Switches(opt.character)
+    variation = {f.name: getattr(opt, f.name) for f in fields(character.Switches) if f.name in given}
+    to = replace(base, **variation)
+    old = replace(own, character=opt.from_character or own.character).load()
+    policy, kept = carried(old_path, old, to.load(), opt)
+    kept["options"] |= asdict(to)
+    save_checkpoint(new_path, policy.arrays(), kept)
+    return kept
+
+
+WORDS = {"ship": (2, 2), "carry": (2, 2), "blend": (3, 100)}  # how many files each command wants, least and most
+
+
+def main(argv=None):
+    """Ship, blend or carry.  Test: tests/extras/test_policies.py::test_carry_command, test_ship, test_wrong_commands"""
+    argv = list(argv or [])
+    n = next((k for k, a in enumerate(argv) if a.startswith("-")), len(argv))
+    words, flags = argv[:n], argv[n:]
+    what, files = (words[0], words[1:]) if words else ("", [])
+    if not {"-h", "--help"} & set(flags):
+        least, most = WORDS.get(what, (1, 0))
+        if not least <= len(files) <= most:
+            asked = " ".join(words) or "no command"
+            raise UserError(f"{asked}: valid: ship RUN OUT.npz, blend OUT.npz A B …, carry OLD.npz NEW.npz, then flags")
+    if what == "carry":
+        opt = cli(Carry, flags, "extras.policies carry", __doc__)
+        check_folders(files[1], read=files[:1])
+        meta = carry(*files, opt, given_flags(flags))
+        print(f"{files[1]}: {meta['options']['character']}, {fmt_count(meta['steps'])} steps before")
+        return
+    opt = cli(Blend, flags, f"extras.policies {what}", __doc__)
+    if what == "ship" and "share" in given_flags(flags):
+        raise UserError("--share is of blend OUT.npz A B …: leave it out")
+    run, out, *others = files if what == "ship" else [files[1], files[0], *files[2:]]
+    check_folders(out)
+    meta = ship(run, out, others, opt.share, opt.gain)
+    mixed = f", {1 - opt.share:g} of it and {opt.share:g} of {', '.join(others)}" if others else ""
+    print(f"{out}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}{mixed}; {meta['licence']}")
+
+
+if __name__ == "__main__":
+    run_main(main)

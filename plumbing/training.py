@@ -1,0 +1,187 @@
+"""What stands around a training loop: a run's options and recipe, its fingerprint, its line of progress.
+
+The command line wins over the character's recipe ([training] in its TOML), the recipe over the defaults.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import importlib
+from pathlib import Path
+
+import numpy as np
+
+from plumbing.cli import UserError, cli, given_flags
+from plumbing.runs import CONFIG, check_run, read_config, stored_options
+
+CHANGEABLE = ("steps", "threads", "resume", "out")  # what may differ when a run is resumed
+
+
+def read_options(kind, argv, prog, description, widths=None):
+    """The options of a new run, or of the one to resume.
+
+    Args      kind : a dataclass that is a `character.Switches` with out, resume, init and recipe; argv : list of str
+              widths : of the policy of --init, path -> {option: value}, where the command line does not say
+    Raises    UserError: a run is there already, or none to resume; the recipe holds what `kind` has not
+    Test      tests/test_ppo.py::test_recipe, test_resume_refuses_other_options, test_init_brings_its_widths
+    """
+    opt, given = cli(kind, argv, prog, description), given_names(argv)
+    opt = dataclasses.replace(opt, out=opt.out or f"runs/{Path(opt.character).stem}")
+    check_run(opt.out, opt.resume)
+    if opt.resume:
+        return resumed_options(opt, argv)
+    char, recipe = opt.load(), {}
+    if opt.recipe != "none":
+        recipe = {k: tuple(v) if isinstance(v, list) else v for k, v in char.training.items() if k != "by"}
+    if odd := sorted(set(recipe) - {f.name for f in dataclasses.fields(kind)}):
+        raise UserError(
+            f"{char.path}: [training] {', '.join(odd)}: no option of {prog}; "
+            'valid: by = "extras.train", which has it, or --recipe none'
+        )
+    if opt.init and widths:
+        recipe |= widths(opt.init)
+    return dataclasses.replace(opt, **{k: v for k, v in recipe.items() if k not in given})
+
+
+def given_names(argv) -> set:
+    """Names of the fields that a command line sets, --no-x being one of x.
+
+    Test      tests/test_ppo.py::test_recipe"""
+    return {name.removeprefix("no_") for name in given_flags(argv)}
+
+
+def resumed_options(opt, argv):
+    """The stored options of the run in opt.out; the command line may change only what keeps the run the same run.
+
+    Raises    UserError: a given option differs from the stored one
+    Test      tests/test_ppo.py::test_resume_refuses_other_options
+    """
+    check_run(opt.out, resume=True)
+    stored, given, values = stored_options(type(opt), opt.out), given_names(argv), {}
+    for f in dataclasses.fields(opt):
+        asked = getattr(opt, f.name)
+        values[f.name] = stored.get(f.name, asked)
+        if f.name in given and asked != values[f.name]:
+            if f.name not in CHANGEABLE:
+                raise UserError(
+                    f"{opt.out}: was started with --{f.name} {values[f.name]}; to resume, leave it out "
+                    f"(can change: {', '.join(CHANGEABLE[:2])})"
+                )
+            values[f.name] = asked
+    return type(opt)(**values | {"resume": True, "out": opt.out})
+
+
+def trained_by(switches, argv, own: str) -> str:
+    """The module that trains: of the run to resume, else of the character's recipe, else `own`.
+
+    Args      switches : `character.Switches`
+    Raises    UserError: no such character
+    Test      tests/test_ppo.py::test_recipe, tests/extras/test_train.py::test_ppo_hands_on"""
+    if {"-h", "--help"} & set(argv) or value_of(argv, "recipe") == "none":
+        return own
+    name = value_of(argv, "character") or switches().character
+    if "--resume" in argv:
+        out = Path(value_of(argv, "out") or f"runs/{Path(name).stem}")
+        return str(read_config(out)["config"].get("by", own)) if (out / CONFIG).is_file() else own
+    return switches(character=name, set=value_of(argv, "set")).load().training.get("by", own)
+
+
+def value_of(argv, name) -> str | None:
+    """What a command line says for --name, the last time it does.
+
+    Test      tests/test_ppo.py::test_recipe"""
+    found = None
+    for a, after in zip(argv, [*argv[1:], None]):
+        flag, equals, text = a.partition("=")
+        if flag == f"--{name}":
+            found = text if equals else after
+    return found
+
+
+def main_of(module: str):
+    """The `main` of a module of extras.  UserError: there is none
+
+    Test      tests/extras/test_train.py::test_ppo_hands_on"""
+    try:
+        if module.startswith("extras."):
+            return importlib.import_module(module).main
+    except (ModuleNotFoundError, AttributeError) as e:
+        if getattr(e, "name", module) not in (module, "main"):
+            raise
+    raise UserError(f"trained by {module[:80]!r}: no such trainer; valid: a module of extras that has a main")
+
+
+# ------------------------------------------------------------------------------------ around the loop
+
+
+def fingerprint(array) -> str:
+    """Hash of the reference motions: tells whether two runs saw the same data.
+
+    Test      tests/test_ppo.py::test_fingerprint"""
+    return hashlib.sha256(np.ascontiguousarray(array)).hexdigest()[:16]
+
+
+def motions(ref) -> dict:
+    """What tells whether two runs saw the same motions, and how much.  Test: tests/test_ppo.py::test_fingerprint"""
+    return {"fingerprint": fingerprint(ref.qpos), "sequences": len(ref.names), "minutes": len(ref) / ref.rate / 60}
+
+
+def check_same(seen, now, out):
+    """UserError unless a run that is resumed sees the motions that it saw before.
+
+    Test      tests/test_ppo.py::test_resume_refuses_other_options"""
+    if not isinstance(seen, dict) or seen.get("fingerprint") != now["fingerprint"]:
+        changed = f"the motions have changed since the run began ({seen} against {now})"
+        raise UserError(f"{out}: {changed}; start a new run with --init {out}")
+
+
+def progress_line(stats) -> dict:
+    """The numbers of an update that a watcher needs, short.
+
+    Test      tests/test_ppo.py::test_line_of_progress"""
+    terms = " ".join(f"{k[2:]} {v:.2f}" for k, v in stats.items() if k.startswith("r_") and v)
+    ends = " ".join(f"{k[4:]} {v}" for k, v in stats.items() if k.startswith("end_") and v)
+    return {
+        "steps/s": f"{stats['steps_per_s']:.0f}",
+        "fails every": f"{stats['time_to_failure']:.2f} s" if stats["failures"] else "never",
+        "survival": f"{stats['survival']:.2f}",
+        "reward": f"{stats['reward']:.2f}",
+        "[": f"{terms} ]",
+        "ends": ends or "none",
+        "kl": f"{stats['kl']:.3f}",
+        "clip": f"{stats['clip_fraction']:.2f}",
+        "ev": f"{stats['explained_variance']:.2f}",
+        "σ": f"{stats['sigma']:.3f}",
+    }
+
+
+@contextlib.contextmanager
+def fitting(path):
+    """A checkpoint is taken over: UserError, naming path, where it is of another run.
+
+    Test      tests/test_ppo.py::test_resume_refuses_a_foreign_checkpoint"""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError) as e:
+        says = f"does not fit this run ({type(e).__name__}: {e}); give another --out, with --init {path}"
+        raise UserError(f"{path}: {says}") from None
+    except UserError as e:
+        raise UserError(f"{path}: {e}") from None
+
+
+def part_of(arrays, name) -> dict:
+    """The arrays called NAME.x, as x.  Test: tests/test_ppo.py::test_resume_is_exact"""
+    return {key.partition(".")[2]: value for key, value in arrays.items() if key.startswith(f"{name}.")}
+
+
+def check_progress(meta):
+    """ValueError unless a checkpoint's counts are integers of at least 0, and its learning rate is a rate.
+
+    Test      tests/robustness/test_fuzz.py::test_run_folders"""
+    for key in ("steps", "updates", "rows"):
+        if type(meta.get(key, 0)) is not int or meta.get(key, 0) < 0:
+            raise ValueError(f"{key} is {str(meta[key])[:80]}, valid: an integer of at least 0")
+    if type(meta["lr"]) not in (int, float) or not meta["lr"] > 0:
+        raise ValueError(f"lr is {str(meta['lr'])[:80]}, valid: a number greater than 0")

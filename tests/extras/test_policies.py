@@ -1,0 +1,300 @@
+"""extras/policies.py: shipped, averaged, and carried over to another body."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_ppo import train, whole  # noqa: F401, whole is a fixture
+
+import character
+import nn
+import ppo
+import retarget
+from env import Env
+from extras import policies
+from extras.policies import Carry, carried, input_names
+from mocap import data
+from plumbing.cli import UserError
+from plumbing.runs import CHECKPOINT, load_checkpoint, save_checkpoint
+from policy import Policy, load_policy, total_steps
+
+pytestmark = pytest.mark.usefixtures("motions_once")
+
+
+# ------------------------------------------------------------------------------------ ship, blend
+
+
+def test_ship(tmp_path, monkeypatch):
+    """A shipped policy acts as the run's does, is small, and carries its data's licence."""
+    folder = tmp_path / "motion"
+    folder.mkdir()
+    (folder / "LICENSE").write_text("Non-commercial.\n")
+    monkeypatch.setattr(data, "sequences", lambda *a, **k: data.builtin_clips()[:1])
+    size = ["--recipe", "none", "--envs", "4", "--horizon", "4", "--steps", "16", "--minibatch", "16"]
+    ppo.main(["--motion", str(folder), "--out", str(tmp_path / "run"), *size])
+    target = tmp_path / "jesse.npz"
+    policies.main(["ship", str(tmp_path / "run"), str(target)])
+    (a, _), (b, meta) = load_policy(tmp_path / "run"), load_policy(target)
+    obs = np.random.default_rng(0).standard_normal((3, a.obs_size)).astype(np.float32)
+    np.testing.assert_array_equal(a.mean_action(obs), b.mean_action(obs))
+    assert meta["licence"] == "weights trained on motion, licensed: Non-commercial." and meta["steps"] == 16
+    assert target.stat().st_size < 4e6
+    assert str(tmp_path) not in json.dumps(meta)  # no path of the machine
+    ppo.main(["--motion", f"builtin,{folder},standing", "--out", str(tmp_path / "both"), *size])
+    ppo.main(["--motion", str(folder), "--init", str(target), "--out", str(tmp_path / "more"), *size])
+    more = policies.ship(tmp_path / "more", tmp_path / "more.npz")
+    assert more["steps"] == 32 == total_steps(load_policy(tmp_path / "more")[1]) and not more["options"]["init"]
+    assert policies.ship(tmp_path / "both", target)["licence"] == meta["licence"]
+    assert load_policy(target)[1]["options"]["motion"] == "builtin,motion,standing"
+    with pytest.raises(UserError):
+        policies.ship(tmp_path / "nothing", target)
+
+
+def test_blended(tmp_path):
+    """Shares of 0 and 1 are the two policies; between them weights, and the normaliser's variances, are means."""
+    paths = tmp_path / "old", tmp_path / "new"
+    for seed, path in enumerate(paths):
+        train(path, 2, "--seed", str(seed))
+    obs = np.random.default_rng(0).standard_normal((5, load_policy(paths[0])[0].obs_size)).astype(np.float32)
+    old, new = (load_policy(p)[0] for p in paths)
+    for share, like in ((0.0, new), (1.0, old)):
+        meta = policies.ship(paths[1], tmp_path / "b.npz", paths[:1], share)
+        assert meta["blend"] == {"with": ["old"], "share": share}
+        got = load_policy(tmp_path / "b.npz")[0]
+        np.testing.assert_allclose(got.mean_action(obs), like.mean_action(obs), atol=1e-5)
+    policies.main(["blend", str(tmp_path / "b.npz"), str(paths[1]), str(paths[0]), "--share", "0.25"])
+    got = load_policy(tmp_path / "b.npz")[0]
+    np.testing.assert_allclose(got.theta_pi, 0.75 * new.theta_pi + 0.25 * old.theta_pi, atol=1e-6)
+    np.testing.assert_allclose(got.norm.var, 0.75 * new.norm.var + 0.25 * old.norm.var, rtol=1e-5)
+    np.testing.assert_allclose(got.norm.mean, 0.75 * new.norm.mean + 0.25 * old.norm.mean, atol=1e-5)
+    policies.ship(paths[1], tmp_path / "b.npz", [paths[0], paths[0], paths[1]], 0.75)
+    np.testing.assert_allclose(
+        load_policy(tmp_path / "b.npz")[0].theta_pi, 0.5 * (new.theta_pi + old.theta_pi), atol=1e-6
+    )
+    policies.ship(paths[1], tmp_path / "b.npz", gain=1.25)
+    x = np.random.default_rng(1).standard_normal((3, new.critic_size))
+    louder = load_policy(tmp_path / "b.npz")[0]
+    inside = np.abs(new.norm(x)) < 8  # the rest is clipped
+    np.testing.assert_allclose(louder.norm(x)[inside], 1.25 * new.norm(x)[inside], rtol=0.01)
+    other = Path(ppo.__file__).parent / "characters" / "jesse-hmd.npz"
+    assert load_policy(other)[1]["licence"] != "MIT"
+    assert policies.ship(other, tmp_path / "again.npz")["licence"] == load_policy(other)[1]["licence"]
+    with pytest.raises(UserError, match="blend .*: networks .*; valid: policies of one ancestor"):
+        policies.ship(paths[1], tmp_path / "c.npz", [other])
+    arrays, meta = load_checkpoint(paths[0] / CHECKPOINT, ("policy.*",))
+    save_checkpoint(tmp_path / "bent.npz", arrays, meta | {"options": meta["options"] | {"set": "pose.spine_y=0.2"}})
+    with pytest.raises(UserError, match="bent.npz: another body or pose"):
+        policies.ship(paths[1], tmp_path / "c.npz", [tmp_path / "bent.npz"])
+    save_checkpoint(tmp_path / "odd.npz", arrays, meta | {"options": meta["options"] | {"set": 5}})
+    with pytest.raises(UserError, match="odd.npz: its options name no character"):
+        policies.ship(paths[1], tmp_path / "c.npz", [tmp_path / "odd.npz"])
+    save_checkpoint(tmp_path / "less.npz", arrays, meta | {"options": meta["options"] | {"set": "reward.q=[0, 1]"}})
+    policies.ship(paths[1], tmp_path / "d.npz", [tmp_path / "less.npz"])  # another reward is the same body
+    with pytest.raises(UserError, match="--share is of blend"):
+        policies.main(["ship", str(paths[0]), str(tmp_path / "c.npz"), "--share", "0.3"])
+    assert not (tmp_path / "c.npz").exists()
+
+
+# ------------------------------------------------------------------------------------ carry
+
+
+def test_input_names(char, ref):
+    """Each name where the observation has that number: looked up in MuJoCo's own arrays."""
+    env = Env(char, ref, 2, seed=1)
+    env.reset()
+    names, m = input_names(char), char.model
+    assert len(names) == len(set(names)) == env.full.shape[1]
+    at = lambda name: env.full[:, names.index(name)]  # noqa: E731
+    for hinge in ("knee_l_y", "hip_r_z"):
+        k = m.joint(hinge).qposadr[0]
+        np.testing.assert_allclose(at(f"q.{hinge}"), env.qpos[:, k], rtol=1e-6)
+        np.testing.assert_allclose(at(f"qd.{hinge}"), env.qvel[:, k - 1], rtol=1e-6)
+    for body in ("head", "foot_r"):
+        np.testing.assert_allclose(at(f"x.{body}.z"), env.xpos[:, m.body(body).id, 2], rtol=1e-5)
+        np.testing.assert_allclose(at(f"R.{body}.R4"), env.xmat[:, m.body(body).id, 6], atol=1e-5)  # row 2, column 0
+    np.testing.assert_allclose(at("user.r.z"), ref.sensor_pos[env.frame, 2, 2], rtol=1e-5)
+    assert set(input_names(char, 1)) < set(names) and "human_pos_in_15.44" in names
+
+
+def test_widened_is_the_same_function():
+    rng = np.random.default_rng(3)
+    mlp = nn.MLP((7, 12, 9, 4), rng=rng, dtype=np.float64)
+    for name in ("b0", "b1", "b2"):
+        mlp.params[name][:] = rng.normal(size=mlp.params[name].shape)
+    wide = policies.widened(mlp, (7, 20, 9, 4), rng)
+    x = rng.normal(size=(30, 7))
+    np.testing.assert_allclose(wide(x), mlp(x), rtol=1e-12)
+    # the new units are silent, not dead: their outgoing weights have a gradient
+    y, cache = wide.forward(x)
+    _, dtheta = wide.backward(rng.normal(size=y.shape), cache)
+    assert np.abs(wide.unflatten(dtheta)["W1"][12:]).min() > 0
+    for sizes in ((7, 12, 4), (8, 20, 9, 4), (7, 20, 8, 4), (7, 20, 9, 5)):
+        with pytest.raises(ValueError, match="expected 4 from 7 to 4"):
+            policies.widened(mlp, sizes, rng)
+
+
+def test_wider_layers():
+    rng = np.random.default_rng(1)
+    old = Policy(9, 11, 3, (8, 6), (7,), 0.1, 2.0, rng)
+    old.norm.update(rng.normal(2.0, 3.0, (50, 11)))
+    new = policies.with_layers(old, (16, 6), (12,), "a.npz")
+    x = rng.normal(2.0, 3.0, (20, 11)).astype(np.float32)
+    np.testing.assert_allclose(new.mean_action(x[:, :9]), old.mean_action(x[:, :9]), atol=1e-6)
+    np.testing.assert_allclose(new.value(new.norm.normalise(x)), old.value(old.norm.normalise(x)), rtol=1e-5)
+    np.testing.assert_array_equal(new.log_std, old.log_std)
+    assert new.shape() == old.shape() | {"hidden": [16, 6], "value_hidden": [12]}
+    for wrong in (((8, 5), (7,)), ((8, 6, 4), (7,)), ((8, 6), (6,))):
+        with pytest.raises(UserError, match="a.npz: its layers are .*none smaller"):
+            policies.with_layers(old, *wrong, "a.npz")
+
+
+def test_headset_only(whole, tmp_path, char):  # noqa: F811
+    """§4.2: where the controllers' numbers are at their means, the policy without them does and expects the same."""
+    rng = np.random.default_rng(0)
+    old, _ = load_policy(whole)
+    new, _ = carried(whole, char, char, Carry(sensors="hmd"))
+    keep = [input_names(char).index(n) for n in input_names(char, 1)]
+    gone = np.setdiff1d(np.arange(459), keep)
+    assert (new.obs_size, new.critic_size) == (153, 423) and len(gone) == 36 and gone.max() < 189
+    x = (old.norm.mean + rng.normal(size=(50, 459)) / old.norm.inv_std).astype(np.float32)
+    x[:, gone] = old.norm.mean[gone]
+    np.testing.assert_allclose(new.mean_action(x[:, keep[:153]]), old.mean_action(x[:, :189]), atol=1e-6)
+    np.testing.assert_allclose(new.value(new.norm.normalise(x[:, keep])), old.value(old.norm.normalise(x)), rtol=1e-5)
+    moved = x.copy()
+    moved[:, gone] += 1.0
+    assert np.abs(old.mean_action(moved[:, :189]) - old.mean_action(x[:, :189])).max() > 1e-4  # they had mattered
+    np.testing.assert_array_equal(new.log_std, old.log_std)
+
+    file, more = str(tmp_path / "hmd.npz"), ["--sensors", "hmd", "--init", str(tmp_path / "hmd.npz")]
+    policies.main(["carry", str(whole), file, "--sensors", "hmd", "--hidden", "16"])
+    _, meta = train(tmp_path / "a", 1, *more, "--hidden", "16")
+    assert meta["options"]["sensors"] == "hmd" and meta["policy"]["obs_size"] == 153 and meta["before"] == 6 * 64
+    with pytest.raises(UserError, match="trained with the headset alone: give --sensors hmd"):
+        policies.main(["carry", file, str(tmp_path / "b.npz"), "--sensors", "full"])
+
+
+def test_symmetric_critic(whole, char):  # noqa: F811
+    """§5.3: the critic goes on without what only it saw; the actor is the same."""
+    old, _ = load_policy(whole)
+    new, meta = carried(whole, char, char, Carry(without=("asymmetric",)))
+    assert new.obs_size == new.critic_size == 189 and meta["options"]["without"] == ["asymmetric"]
+    x = (old.norm.mean + np.random.default_rng(1).normal(size=(20, 459)) / old.norm.inv_std).astype(np.float32)
+    x[:, 189:] = old.norm.mean[189:]
+    np.testing.assert_allclose(new.mean_action(x[:, :189]), old.mean_action(x[:, :189]), atol=1e-6)
+    seen = new.norm.normalise(x[:, :189])
+    np.testing.assert_allclose(new.value(seen), old.value(old.norm.normalise(x)), rtol=1e-5)
+
+
+def test_another_character(whole, tmp_path, capsys):  # noqa: F811
+    """What has the same name goes on, whatever its place; the rest is silent; normaliser and σ begin anew."""
+    old, _ = load_policy(whole)
+    file = tmp_path / "dino.npz"
+    policies.main(["carry", str(whole), str(file), "--character", "dino"])
+    assert "jesse's policy: 459 of 487 inputs and 33 of 37 torques of dino" in capsys.readouterr().out
+    _, meta = train(tmp_path / "dino", 1, "--character", "dino", "--init", str(file))
+    assert meta["policy"]["action_size"] == 37 and meta["options"]["character"] == "dino"
+    jesse, dino = character.load("jesse"), character.load("dino")
+    clip = data.builtin_clips()[0][:40]
+    a, b = (Env(c, retarget.reference(c, [clip]), 3, threads=1) for c in (jesse, dino))
+    new, _ = load_policy(file)
+    np.testing.assert_allclose(new.log_std, np.log(0.06), rtol=1e-6)  # of Dino's recipe
+    assert new.norm.count == 0
+    names = [input_names(c) for c in (jesse, dino)]
+    assert [len(n) for n in names] == [a.full.shape[1], b.full.shape[1]]
+    x = np.random.default_rng(0).normal(size=(5, len(names[0]))).astype(np.float32)
+    y = np.random.default_rng(1).normal(size=(5, len(names[1]))).astype(np.float32)  # what is new can be anything
+    for i, name in enumerate(names[1]):
+        if name in names[0]:
+            y[:, i] = x[:, names[0].index(name)]
+    had, has = old.actor(x[:, : old.obs_size]), new.actor(y[:, : new.obs_size])
+    for k, h in enumerate(dino.driven):
+        hinge = dino.hinges[h]
+        want = had[:, jesse.hinges.index(hinge)] if hinge in jesse.hinges else 0.0
+        np.testing.assert_allclose(has[:, k], want, atol=1e-5, err_msg=hinge)
+    np.testing.assert_allclose(new.critic(y), old.critic(x), atol=1e-5)
+
+
+def saved(folder, char, **options):
+    """A policy of a character, not trained, and its file."""
+    rng = np.random.default_rng(0)
+    sizes = len(input_names(char)), len(char.driven)
+    policy = Policy(sizes[0] - 270, sizes[0], sizes[1], (8,), (4,), 0.1, 1.0, rng)
+    policy.theta_pi += 0.3 * rng.standard_normal(policy.theta_pi.size).astype(np.float32)
+    policy.norm.update(rng.normal(size=(50, sizes[0])))
+    path, told = folder / "p.npz", {"character": char.name, "motion": "builtin"} | options
+    save_checkpoint(path, policy.arrays(), {"policy": policy.shape(), "options": told, "steps": 5})
+    return policy, path
+
+
+def test_a_variation(tmp_path):
+    """Dino's tail without motors: four are gone, the others' torques and the normaliser are as they were."""
+    rng = np.random.default_rng(0)
+    dino, limp = (character.load("dino", tail=tail) for tail in (None, "passive"))
+    old, path = saved(tmp_path, dino)
+    new, _ = carried(path, dino, limp, Carry())
+    x = rng.normal(size=(5, old.obs_size)).astype(np.float32)
+    kept = [k for k, h in enumerate(dino.driven) if not dino.hinges[h].startswith("tail")]
+    np.testing.assert_allclose(new.mean_action(x), old.mean_action(x)[:, kept], atol=1e-6)
+    np.testing.assert_array_equal(new.norm.mean, old.norm.mean)
+    np.testing.assert_array_equal(new.log_std, old.log_std[kept])
+    small = character.load("dino", scale=0.5)  # limits grow with springs and weights: the same action does the same
+    np.testing.assert_allclose(carried(path, dino, small, Carry())[0].mean_action(x), old.mean_action(x), atol=1e-6)
+
+
+def test_another_body(tmp_path):
+    """Other limits and springs: in the default pose the same torque acts on every joint, and is explored as widely."""
+    change = ("torque.base.default=400", "torque.scale.Neck=0.5", "passive.stiffness.spine=80", 'passive.hold=["head"]')
+    before, after = character.load("dino"), character.load("dino", set=change)
+    old, path = saved(tmp_path, before)
+    new, _ = carried(path, before, after, Carry())
+    x = np.random.default_rng(0).normal(size=(5, old.obs_size)).astype(np.float32)
+    assert not np.allclose(before.limits, after.limits)
+    torque = []
+    for char, policy in ((before, old), (after, new)):
+        m, h = char.model, char.driven
+        spring = m.jnt_stiffness[1 + h] * (m.qpos_spring[7 + h] - char.default[h])
+        torque.append(policy.mean_action(x) * char.limits + spring)
+    np.testing.assert_allclose(torque[0], torque[1], rtol=1e-4, atol=1e-2)
+    sigma = [np.exp(p.log_std) * c.limits for p, c in ((old, before), (new, after))]
+    np.testing.assert_allclose(sigma[0], sigma[1], rtol=1e-5)
+    bias = [policies.with_limits(p, c, c).actor.params["b1"].copy() for p, c in ((new, after),)]
+    np.testing.assert_array_equal(bias[0], new.actor.params["b1"])  # the same body: nothing
+
+
+def test_carry_command(tmp_path, capsys):
+    """The old body from a file; the policy's own variation where no flag says otherwise; what the file says then."""
+    dino = character.load("dino")
+    text = dino.path.read_text().replace("default = 288.0", "default = 144.0")
+    (tmp_path / "old.toml").write_text(text)
+    (tmp_path / "dino.xml").write_text(dino.xml.read_text())
+    _, path = saved(tmp_path, dino, set="reward.contact=[0.5, 1.0]")
+    out = tmp_path / "new.npz"
+    args = ["carry", str(path), str(out), "--from-character", str(tmp_path / "old.toml"), "--hidden", "12"]
+    policies.main([*args, "--value-hidden", "6"])
+    assert "new.npz: dino, 5 steps before" in capsys.readouterr().out
+    (a, _), (b, meta) = load_policy(path), load_policy(out)
+    np.testing.assert_allclose(b.log_std, a.log_std + np.log(0.5), rtol=1e-5)
+    assert meta["options"]["set"] == "reward.contact=[0.5, 1.0]" and meta["options"]["character"] == "dino"
+    assert (b.hidden, b.value_hidden, meta["carried"], meta["steps"]) == ((12,), (6,), "p.npz", 5)
+    policies.main(["carry", str(path), str(out), "--tail", "passive", "--set", ""])
+    _, meta = load_policy(out)
+    assert meta["options"]["tail"] == "passive" and not meta["options"]["set"] and meta["policy"]["action_size"] == 33
+    with pytest.raises(UserError, match="33 actions.*37: give the body it was trained with as --from-character"):
+        carried(out, dino, dino, Carry())
+    save_checkpoint(path, a.arrays(), {"policy": a.shape()})
+    with pytest.raises(UserError, match="does not say of which character"):
+        policies.main(["carry", str(path), str(out)])
+
+
+def test_wrong_commands(tmp_path, capsys):
+    for words in ([], ["shop"], ["ship", "a"], ["ship", "a", "b", "c"], ["blend", "a", "b"], ["carry", "a"]):
+        with pytest.raises(UserError, match="valid: ship RUN OUT.npz, blend OUT.npz A B …, carry OLD.npz NEW.npz"):
+            policies.main(words)
+    with pytest.raises(SystemExit) as end:
+        policies.main(["carry", "--help"])
+    assert end.value.code == 0 and "--from-character" in capsys.readouterr().out
+    with pytest.raises(UserError, match="no checkpoint"):
+        policies.main(["ship", str(tmp_path / "none.npz"), str(tmp_path / "b.npz")])
+    with pytest.raises(UserError, match="there is no folder"):
+        policies.main(["ship", "a.npz", str(tmp_path / "none" / "b.npz")])
