@@ -1,4 +1,4 @@
-"""headset.calibration."""
+"""A user's size, floor and forward direction from a second of headset; poses at the control rate from any stream."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Resampler:
 
 
 CALIBRATION, SEEN = 1.0, 1000  # s of headset; readings kept of it: of a faster stream every other one
-STANDING = (1.0, 1.9)  # m, where the headset of a standing user may be; otherwise the floor is not at height 0
+STANDING = (1.0, 2.1)  # m, where the headset of a standing user may be (recorded: 1.37 to 2.00); else no floor at 0
 AVERAGE = 1.64  # m, headset of a user of 1.75 m, taken where the floor is not known.  ASSUMED
 HIPS = 0.554  # of that height: the hips, which a headset does not see, for `scale_z = "hip"`.  ASSUMED
 
@@ -81,7 +81,7 @@ def calibrate(char: Character, pos, quat, user_height: float | None = None) -> C
 
     Height    `standing_height`
     Scale     `retarget.sensor_scale`, as in training
-    Floor     at height 0 of the stream if that makes the user's headset 1.0 to 1.9 m high; otherwise 1.64 m below it;
+    Floor     at height 0 of the stream if that makes the user's headset 1.0 to 2.1 m high; otherwise 1.64 m below it;
               with user_height, that much below it
     Forward   the mean heading; the place: the median
     ASSUMED   all but the scale; the paper does not say how a real user is measured
@@ -101,17 +101,20 @@ def calibrate(char: Character, pos, quat, user_height: float | None = None) -> C
 class Stream:
     """Samples as they come -> poses at the control rate in the character's world.
 
-    axes, grip  : as `to_world`; sample_rate : of a stream without times [Hz]; user_height : as `calibrate`
+    axes, grip, unit : as `to_world`; order : which of the source's devices are head, left, right
+    sample_rate : of a stream without times [Hz]; user_height : as `calibrate`
     devices     : as `Guard`
     Test          tests/headset/test_stream.py::test_round_trip, test_never_nan
     """
 
     def __init__(
-        self, char, axes="unity", rate=CONTROL_RATE, sample_rate=SAMPLE_RATE, grip=None, user_height=None, devices=3
-    ):
+        self, char, axes="unity", rate=CONTROL_RATE, sample_rate=SAMPLE_RATE, grip=None, user_height=None, devices=3,
+        unit=None, order=(0, 1, 2),
+    ):  # fmt: skip
         if axes not in AXES:
             raise UserError(f"--axes {axes}: unknown; valid: {', '.join(AXES)}")
         self.char, self.axes, self.grip, self.user_height = char, axes, grip, user_height
+        self.unit, self.order = unit, list(order)
         self.clock, self.guard, self.resampler = Clock(sample_rate), Guard(rate, devices), Resampler(rate)
         self.calibration, self.seen, self.rows = None, [], 0
 
@@ -119,7 +122,10 @@ class Stream:
         """The ticks that a reading completes; none in the first second, which calibrates."""
         self.rows += 1
         t = self.clock.stamp(sample.t)
-        return [] if t is None else self._go(Sample(t, *to_world(sample.pos, sample.quat, self.axes, self.grip)))
+        if t is None:
+            return []
+        poses = to_world(sample.pos[self.order], sample.quat[self.order], self.axes, self.grip, self.unit)
+        return self._go(Sample(t, *poses))
 
     def idle(self, seconds: float) -> list[Sample]:
         """Nothing came for so long: the ticks of a drop-out."""

@@ -1,4 +1,4 @@
-"""headset.reader."""
+"""A headset's lines -> samples in our axes: columns, axes, and what stands in for a device that is lost."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from human import heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate, quat_slerp
 from mocap.data import CONTROL_RATE
@@ -39,19 +40,63 @@ class Sample(NamedTuple):
     quat: np.ndarray
 
 
-def column(name: str) -> str | None:
-    """The canonical name of a column, or None for one that is not ours.
+_HEAD = ("head", "hmd", "headset", "centereyeanchor", "centereye", "maincamera")
+_SIDES = ("left", "right")
+_HELD = ("hand", "controller", "touch", "wand", "index", "anchor", "device", "tracker")
+_POSITION = ("p", "pos", "position", "loc", "location", "translation")
+_ROTATION = ("q", "quat", "quaternion", "rot", "rotation", "ori", "orient", "orientation")
+_MATRIX = ("m", "mat", "matrix", "pose", "transform")
+_WORD = "|".join(sorted((*_HEAD, *_SIDES, *_HELD, *_POSITION, *_ROTATION, *"xyzw"), key=len, reverse=True))
+_TIME = re.compile(r"(?:delta|elapsed|session|system)?(?:time|timestamp|t)(s|sec|seconds|ms|us|ns|milliseconds)?")
+_SECONDS = {"ms": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "ns": 1e-9}
 
-    Test      tests/headset/test_stream.py::test_columns"""
-    name = name.strip().strip('"').lower()
-    if name in ("time", "t", "timestamp"):
+
+def column(name: str) -> str | None:
+    """The canonical name of a column, or None for one that is not ours: "HeadPosX", "left hand.rotation.w" …
+
+    Rule      the words of a device, of position or rotation, and an axis; in any order and case, with or without
+              anything between them; without position or rotation x, y, z are a position.  A pose as a matrix has its
+              row and column: "hmd_m03", "left_matrix[1][2]"
+    Test      tests/headset/test_stream.py::test_columns, tests/headset/test_columns.py::test_any_order_and_case"""
+    text = re.sub(r"[\[(](?:c|m)?m[\])]|[_ ](?:c|m)?m$", "", name.strip().strip('"'))  # a length's unit
+    letters = re.sub(r"[^a-z]", "", text.lower())
+    if _TIME.fullmatch(re.sub(r"[^a-z]", "", name.lower())):
         return "time"
-    device = r"(head|hmd|headset|(?:left|right)(?:_hand|_controller)?)"
-    found = re.fullmatch(device + r"_(?:(?:p|pos_|position_|)([xyz])|(?:q|rot_|rotation_)([xyzw]))", name)
-    if not found:
+    if re.search(r"\d", text):
+        return _matrix_column(letters, re.findall(r"\d", text))
+    words = _words(letters)
+    device, axis = _device(words), [w for w in words if w in tuple("xyzw")]
+    turns, moves = (any(w in kind for w in words) for kind in (_ROTATION, _POSITION))
+    if not device or len(axis) != 1 or (turns and moves) or (axis == ["w"] and not turns):
         return None
-    device = "head" if found[1] in ("head", "hmd", "headset") else found[1].split("_")[0]
-    return f"{device}_p{found[2]}" if found[2] else f"{device}_q{found[3]}"
+    return f"{device}_{'q' if turns else 'p'}{axis[0]}"
+
+
+def _words(letters) -> list[str]:
+    """The words that, one after the other, make up the letters; none if they do not, or if they are too many."""
+    found = re.findall(_WORD, letters) if len(letters) < 80 else []
+    return found if "".join(found) == letters else []
+
+
+def _device(words) -> str | None:
+    devices = {"head" for w in words if w in _HEAD} | {w for w in words if w in _SIDES}
+    return devices.pop() if len(devices) == 1 else None
+
+
+def _matrix_column(letters, digits) -> str | None:
+    """ "hmd_m03" -> head_m03: row and column, from 0, of the upper three rows of a 4 x 4 matrix."""
+    device = re.fullmatch(f"({'|'.join((*_HEAD, *_SIDES))})(?:{'|'.join(_HELD)})*(?:{'|'.join(_MATRIX)})*", letters)
+    if not device or len(digits) != 2 or int(digits[0]) > 2 or int(digits[1]) > 3:
+        return None
+    return f"{_device([device[1]])}_m{digits[0]}{digits[1]}"
+
+
+def time_unit(name: str) -> float:
+    """Seconds in the unit that a time column's name gives: "delta_time_ms" is in milliseconds; 1 without one.
+
+    Test      tests/headset/test_columns.py::test_catalogue"""
+    found = _TIME.fullmatch(re.sub(r"[^a-z]", "", name.lower()))
+    return _SECONDS.get(found[1] if found else None, 1.0)
 
 
 class Reader:
@@ -71,6 +116,7 @@ class Reader:
         self.wanted = COLUMNS[: 1 + devices * len(PARTS)]
         self.line = self.unreadable = self.in_a_row = 0
         self.at = self.names = None
+        self.matrices, self.second = [], 1.0
 
     def read(self, lines):
         """Samples of an iterable of lines (bytes or text), one by one."""
@@ -99,7 +145,7 @@ class Reader:
                 continue
             self.in_a_row = 0
             devices = values[1:].reshape(3, 7)
-            if len(self.steps) < JUDGED and not fault(devices[0]):
+            if len(self.steps) < JUDGED and not fault(devices[0], far=np.inf):
                 self.judge(float(values[0]))
             yield Sample(float(values[0]), devices[:, :3], devices[:, 3:])
         if self.at is None:
@@ -133,8 +179,14 @@ class Reader:
         if ours(mark) > max(ours(","), 1):
             valid = "commas, and points in the numbers"
             raise UserError(f"{self.name}, line {self.line}: {SEPARATORS[mark]} between the columns; valid: {valid}")
-        missing = [c for c in self.wanted[1:] if c not in known]
-        twice = [c for c, k in Counter(known).items() if c and k > 1]
+        used = DEVICES[: len(self.wanted) // len(PARTS)]
+        entries = [[f"{d}_m{i}{j}" for i in range(3) for j in range(4)] for d in used]
+        self.matrices = [
+            (k, [known.index(c) for c in names]) for k, names in enumerate(entries) if set(names) <= set(known)
+        ]
+        told = {f"{DEVICES[k]}_{p}" for k, _ in self.matrices for p in PARTS}
+        missing = [c for c in self.wanted[1:] if c not in known and c not in told]
+        twice = [c for c, k in Counter(known).items() if c and k > 1 and c != "time"]
         if twice:
             raise UserError(f"{self.name}, line {self.line}: column {twice[0]} is there twice; valid: once each")
         if missing:
@@ -145,6 +197,7 @@ class Reader:
                 f"it has {', '.join(self.names)[:200]}; valid: {valid_columns()}{alone}"
             )
         self.at = [known.index(c) if c in known else -1 for c in self.wanted]
+        self.second = time_unit(self.names[self.at[0]]) if self.at[0] >= 0 else 1.0
 
     def values(self, line):
         """The numbers of a row in the order of COLUMNS.  ValueError: which column, and why."""
@@ -156,18 +209,39 @@ class Reader:
             raise ValueError(f"column {column}: {len(cells)} cells; valid: {valid}")
         out = np.full(len(COLUMNS), np.nan)
         for k, i in enumerate(self.at):
-            cell = cells[i].strip().strip('"') if i >= 0 else ""
-            if cell.lower() not in EMPTY:
-                try:
-                    out[k] = parse_number(cell)
-                except ValueError:
-                    raise ValueError(f"column {self.names[i]}: {cell[:40]!r}; valid: a number, or nothing") from None
+            out[k] = self.number(cells, i)
+        out[0] *= self.second
+        for k, at in self.matrices:
+            out[1 + 7 * k : 8 + 7 * k] = pose_of(np.array([self.number(cells, i) for i in at]).reshape(3, 4))
         return out
+
+    def number(self, cells, i):
+        """A cell's number; NaN for a column that is not there, or an empty cell."""
+        cell = cells[i].strip().strip('"') if i >= 0 else ""
+        if cell.lower() in EMPTY:
+            return np.nan
+        try:
+            return parse_number(cell)
+        except ValueError:
+            raise ValueError(f"column {self.names[i]}: {cell[:40]!r}; valid: a number, or nothing") from None
+
+
+def pose_of(matrix):
+    """The upper three rows of a pose's matrix -> position and quaternion x, y, z, w (7,); NaN if it is no rotation.
+
+    Test      tests/headset/test_columns.py::test_matrices"""
+    turn = matrix[:, :3]
+    if not np.isfinite(matrix).all() or not np.allclose(turn @ turn.T, np.eye(3), atol=0.05) or np.linalg.det(turn) < 0:
+        return np.full(7, np.nan)
+    return np.concatenate([matrix[:, 3], Rotation.from_matrix(turn).as_quat()])
 
 
 def valid_columns() -> str:
     """The columns as a complaint lists them.  Test: tests/headset/test_stream.py::test_columns"""
-    return "time (optional) and DEVICE_px, _py, _pz, _qx, _qy, _qz, _qw for DEVICE head, left, right"
+    return (
+        "time (optional) and DEVICE_px, _py, _pz, _qx, _qy, _qz, _qw for DEVICE head, left, right, "
+        "or a matrix's DEVICE_m00 to _m23"
+    )
 
 
 def is_live(path) -> bool:
@@ -238,25 +312,30 @@ def arriving(items, silence: float, period: float):
 
 # ------------------------------------------------------------------------------------ axes
 
+_BACKWARD = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])  # x right, y up, z backward: right-handed
 AXES = {  # name -> matrix whose rows are our x (forward), y (left), z (up) in the source's coordinates
     "unity": np.array([[0.0, 0, 1], [-1, 0, 0], [0, 1, 0]]),  # x right, y up, z forward: left-handed
-    "openxr": np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]),  # x right, y up, z backward: right-handed
-    "mujoco": np.eye(3),  # ours
+    "openxr": _BACKWARD,  # grip poses, as OpenXR's and WebXR's gripSpace
+    "mujoco": np.eye(3),  # ours, and ROS's
+    "openvr": _BACKWARD,  # SteamVR and WebVR: poses of the devices themselves, WebXR's targetRaySpace
+    "unreal": np.diag([1.0, -1.0, 1.0]),  # x forward, y right, z up: left-handed; centimetres
 }
+UNIT = {"unreal": 0.01}  # metres a unit, where it is not 1
 # How far the fingers point below the controller's forward axis [degrees].  ASSUMED.  90: OpenXR's grip pose, whose
 # forward axis runs along the fist from the little finger to the thumb.  15: what points, as a ray or a sabre does.
-GRIP = {"unity": 15.0, "openxr": 90.0, "mujoco": 90.0}
+# Measured: the forearm lies 5 to 55 degrees below it in 45 of Unity's recordings, 15 to 22 in three of WebVR's.
+GRIP = {"unity": 15.0, "openxr": 90.0, "mujoco": 90.0, "openvr": 15.0, "unreal": 15.0}
 
 
-def to_world(pos, quat, axes: str, grip: float | None = None):
+def to_world(pos, quat, axes: str, grip: float | None = None, unit: float | None = None):
     r"""A source's axes -> ours: x forward, y left, z up, right-handed.
 
     Equation  p' = M p;  R' = M R Mᵀ, so that (x, y, z, w) -> (w, det(M) M (x, y, z)): an axis of rotation is an
               axial vector, and a left-handed source's turns are the other way round
               hands: R' R_y(−(90° − grip)), because the canonical hand's fingers point along −z
-    Args      pos (..., 3, 3) [m], quat (..., 3, 4) x, y, z, w, of head, left, right
-              axes : unity, openxr or mujoco; grip [degrees], of the axes by default
-    Returns   pos (..., 3, 3), quat (..., 3, 4) w, x, y, z
+    Args      pos (..., 3, 3), quat (..., 3, 4) x, y, z, w, of head, left, right
+              axes : one of AXES; grip [degrees], unit [m], of the axes by default
+    Returns   pos (..., 3, 3) [m], quat (..., 3, 4) w, x, y, z
     Raises    UserError: unknown axes
     Test      tests/headset/test_stream.py::test_axes_by_hand, test_axes_against_matrices, test_grip
     """
@@ -268,7 +347,7 @@ def to_world(pos, quat, axes: str, grip: float | None = None):
         q = np.concatenate([quat[..., 3:], np.round(np.linalg.det(m)) * (quat[..., :3] @ m.T)], axis=-1)
         if turn:
             q[..., 1:, :] = quat_mul(q[..., 1:, :], quat_about(1, turn))
-        return np.asarray(pos, float) @ m.T, q
+        return np.asarray(pos, float) @ m.T * (UNIT.get(axes, 1.0) if unit is None else unit), q
 
 
 # ------------------------------------------------------------------------------------ what can go wrong
@@ -360,13 +439,13 @@ class Track:
     pace: float = 0.0  # of mix, per second
 
 
-def fault(row) -> str | None:
+def fault(row, far=FAR_AWAY) -> str | None:
     """Why a device's row (7,) cannot be a pose, or None.  Test: tests/headset/test_stream.py::test_faults"""
     if not np.isfinite(row).all():
         return "not finite"
     if not row.any():
         return "all zero"
-    if np.abs(row[:3]).max() > FAR_AWAY:
+    if np.abs(row[:3]).max() > far:
         return "far away"
     return "no rotation" if abs(np.linalg.norm(np.clip(row[3:], -1e3, 1e3)) - 1.0) > 0.1 else None
 

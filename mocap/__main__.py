@@ -1,4 +1,4 @@
-"""Motion capture on the command line: python -m mocap inspect FILE | FOLDER, or fetch NAME."""
+"""Motion capture on the command line: python -m mocap inspect PATH..., or fetch NAME."""
 
 from mocap.inspect import main
 from plumbing.cli import run_main

@@ -101,14 +101,13 @@ def _text(path, what) -> str:
     if not data.strip():
         _fail(path, f"the file is empty; expected {what}")
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        _fail(path, "UTF-16 text; expected ASCII or UTF-8 (save it again in that encoding)")
+        _fail(path, "UTF-16 text; expected ASCII, UTF-8 or Latin-1 (save it again in that encoding)")
     if b"\0" in data:
         _fail(path, f"binary data (zero at byte {data.index(0)}); expected {what}")
     try:
         text = data.removeprefix(b"\xef\xbb\xbf").decode("utf-8")
-    except UnicodeDecodeError as e:
-        line = data.count(b"\n", 0, e.start) + 1
-        _fail(path, f"byte 0x{data[e.start]:02x} is not UTF-8; expected {what}", line)
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")  # old files have umlauts in comments and in :documentation
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     return re.sub(r"#.*", "", text) if "#" in text else text
 

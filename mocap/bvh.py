@@ -55,12 +55,12 @@ class Bvh:
 # ---------------------------------------------------------------- reading
 
 
-def read(path) -> Bvh:
+def read(path, frame_time=None) -> Bvh:
     """Read one BVH file.
 
     Format    keywords in any case; any line endings, tabs, blank lines; `{` on the joint's line or the next; up to six
               distinct channels per joint in any order; motion rows may be wrapped or joined if the total count fits
-    Args      path : str or path-like
+    Args      path : str or path-like; frame_time : [s] to take whatever the file says
     Returns   Bvh
     Raises    BvhError: the file is malformed (one line: file, line or joint, and what would have been valid)
               OSError: the file cannot be opened, or is no regular file
@@ -89,7 +89,7 @@ def read(path) -> Bvh:
     names, parents, offsets, end_sites, channels = _parse_hierarchy(path, text, end)
     if not motion:
         _fail(path, "no MOTION section; expected MOTION, 'Frames: N' and 'Frame Time: SECONDS' after the hierarchy")
-    frames, frame_time, body = _parse_motion_header(path, data, motion.end())
+    frames, frame_time, body = _parse_motion_header(path, data, motion.end(), frame_time)
     values = _parse_values(path, data, body, frames, names, channels)
     return Bvh(names, parents, offsets, end_sites, channels, values, frame_time, path)
 
@@ -243,7 +243,7 @@ def _parse_hierarchy(path, text, end):
     return names, np.array(parents), np.array(offsets), end_sites, channels
 
 
-def _parse_motion_header(path, data, start):
+def _parse_motion_header(path, data, start, told=None):
     """`Frames: N` and `Frame Time: s` from byte start on -> frames, frame_time, the byte where the values begin."""
     found = re.compile(rb"\s*Frames\s*:\s*(\S*)", re.I).match(data, start)
     if not found:
@@ -254,12 +254,21 @@ def _parse_motion_header(path, data, start):
     time = re.compile(rb"\s*Frame[ \t]*Time\s*:\s*(\S*)", re.I).match(data, found.end())
     if not time:
         _fail(path, "no 'Frame Time: SECONDS' after Frames; expected it there", line)
-    frame_time = _number(time[1].decode("latin-1"))
+    frame_time = told or _number(time[1].decode("latin-1"))
     least, most = FRAME_TIMES
     if frame_time is None or not least <= frame_time <= most:
-        valid = f"a positive number of seconds, {least:g} to {most:g}"
+        valid = f"a positive number of seconds, {least:g} to {most:g}{_meant(frame_time)}"
         _fail(path, f"Frame Time: {_show(time[1])}; expected {valid}", _line(data, time.start(1)))
     return int(word), frame_time, time.end()
+
+
+def _meant(frame_time) -> str:
+    """What a frame time of 33.3 or 120 was meant to be."""
+    if frame_time is None or not 1.0 < frame_time <= 1000.0:
+        return ""
+    if float(frame_time).is_integer() and frame_time >= 24:
+        return f"; a rate? then --rate {frame_time:g}"
+    return f"; milliseconds? then --rate {1000.0 / frame_time:.3g}"
 
 
 def _parse_values(path, data, start, frames, names, channels):

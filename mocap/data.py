@@ -26,7 +26,7 @@ import numpy as np
 from human import Clip, resample
 from mocap import bvh, gait
 from mocap.guess import _unknown
-from mocap.rigs import AS_IT_IS, HELP, RIGS, _unit, canonical, from_amc, is_amc, read, rig_of
+from mocap.rigs import AS_IT_IS, FLOORS, HELP, REST_POSES, RIGS, _unit, canonical, from_amc, is_amc, known_rig, read
 from mocap.stitch import stitch
 from plumbing.cli import UserError, arg
 
@@ -78,6 +78,9 @@ class MotionFlags:
     joint_map: str | None = arg(None, HELP["joint_map"])
     unit: str | None = arg(None, HELP["unit"])
     up: str | None = arg(None, HELP["up"])
+    rate: float | None = arg(None, HELP["rate"])
+    floor: str | None = arg(None, HELP["floor"], choices=FLOORS)
+    rest_pose: str | None = arg(None, HELP["rest_pose"], choices=REST_POSES)
 
 
 def builtin_clips(rate=CONTROL_RATE, seed=0, name="builtin") -> list[Clip]:
@@ -124,6 +127,13 @@ def licences(sets) -> list[str]:
     return out
 
 
+def files_of(path: Path) -> list[Path]:
+    """The motion files of a folder and below, or the file itself.  Test: tests/mocap/test_mocap.py::test_load_errors"""
+    if not path.is_dir():
+        return [path]
+    return sorted(f for f in path.rglob("*") if f.suffix.lower() in (".bvh", ".amc") and not f.is_dir())
+
+
 def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS_IT_IS) -> list[Clip]:
     """Single clips of a data set, at one rate.
 
@@ -147,8 +157,7 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
         path = Path(motion)
         if not path.exists():
             raise UserError(f"{motion}: no such file or folder; valid: {SETS}")
-        found = (f for f in path.rglob("*") if f.suffix.lower() in (".bvh", ".amc") and not f.is_dir())
-        files = sorted(found) if path.is_dir() else [path]
+        files = files_of(path)
         if not files:
             raise UserError(f"{motion}: a folder without motion; valid: one that holds .bvh or .amc files")
         top = path if path.is_dir() else path.parent
@@ -238,31 +247,32 @@ def read_clips(paths, reading=AS_IT_IS, among=None) -> list[Clip]:
     out = []
     for path in paths:
         if is_amc(path):
-            out.append(from_amc(path))
+            out.append(from_amc(path, reading))
             continue
-        b = read(path)
-        known = None if reading.joint_map else rig_of(b)
-        if known:
-            out.append(canonical(b, *rig_for(b, reading)))
+        b = read(path, reading)
+        if not reading.joint_map and known_rig(b):
+            out.append(canonical(b, *rig_for(b, reading), reading))
             continue
         key = _skeleton(b)
         if key not in measured:
             if sampled is None:
                 files = [f for f in among if not is_amc(f)]
-                sampled = list(filter(None, map(_read_or_none, files[:: -(-len(files) // SAMPLE)])))
+                chosen = files[:: -(-len(files) // SAMPLE)]
+                sampled = [s for s in (_read_or_none(f, reading) for f in chosen) if s]
             measured[key] = rig_for(b, reading, [s for s in sampled if _skeleton(s) == key] or [b])
-        out.append(canonical(b, *measured[key]))
+        out.append(canonical(b, *measured[key], reading))
     return out
 
 
 def _skeleton(b):
     """What files of one skeleton have in common: all but the root's OFFSET."""
-    return b.names, tuple(b.parents), np.round(b.offsets[1:], 3).tobytes()
+    ends = tuple((n, *np.round(v, 3)) for n, v in b.end_sites.items())
+    return b.names, tuple(b.parents), np.round(b.offsets[1:], 3).tobytes(), ends
 
 
-def _read_or_none(path):
+def _read_or_none(path, reading):
     try:
-        return read(path)
+        return read(path, reading, quiet=True)
     except UserError:
         return None  # told when it is its turn
 
@@ -272,8 +282,8 @@ def rig_for(b: bvh.Bvh, reading=AS_IT_IS, group=None):
 
     Test      tests/mocap/test_rigs.py::test_any_rig, ::test_overrides
     """
-    known = None if reading.joint_map else rig_of(b)
+    known = None if reading.joint_map else known_rig(b)
     if not known:
-        return _unknown(group or [b], reading)
+        return _unknown(b, group or [b], reading)
     rig, unit, up = RIGS[known], _unit("--unit", reading.unit), reading.up
     return replace(rig, unit=unit or rig.unit, up=up or rig.up), known

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from human import FEET, PARENTS, SEG, SEGMENTS, linear_velocity, quat_conj, quat_rotate
 from mocap import bvh
-from mocap.rigs import HIPS, RIGS, UNITS, UPS, Rig, _frame, _from_file, _human, _pose, _unit, _up
+from mocap.rigs import RIGS, UPS, Rig, _frame, _from_file, _human, _pose, _unit, _up, find_unit, say, unit_line
 from plumbing.cli import UserError, printable
 from plumbing.files import read_toml
 
@@ -27,7 +27,7 @@ _WORDS = {  # what joints are called, side and decoration apart; the first that 
     "hand": ("wrist", "hand"),
 }
 _LEG, _ARM = ("thigh", "shin", "foot", "ball"), ("upper_arm", "forearm", "hand")
-_SIDES = {"l": "l", "left": "l", "r": "r", "right": "r"}
+_SIDES = {"l": "l", "left": "l", "lft": "l", "r": "r", "right": "r", "rgt": "r"}
 _DECORATION = {
     "joint", "jnt", "bone", "bip", "biped", "mixamorig", "def", "org", "character", "rig", "b", "j", "m", "avg",
 }  # fmt: skip
@@ -51,6 +51,34 @@ def read_name(name: str):
     return side, word
 
 
+SHARED = 0.8  # of the joints: a prefix or suffix that so many have is decoration.  ASSUMED
+
+
+def bare_names(names) -> list[str]:
+    """Joints' names without the prefix and the suffix that nearly all of them share, and without numbers.
+
+    Test      tests/mocap/test_mend.py::test_any_prefix_or_suffix, ::test_bare_names"""
+    names = [re.sub(r"\d+", "_", n) for n in names]
+    for _ in range(2):  # a suffix may hide behind another: "Hips:rig_01"
+        names = _without_prefix(names)
+        names = [n[::-1] for n in _without_prefix([n[::-1] for n in names])]
+        names = [n.rsplit(":", 1)[-1] for n in names]
+    return names
+
+
+def _without_prefix(names):
+    """Names without the longest beginning that nearly all share: in order of the alphabet they surround the middle."""
+    if len(names) < 5:
+        return names
+    middle = sorted(names)[len(names) // 2][:100]
+    best = 0
+    for k in range(1, len(middle) + 1):
+        if sum(n.startswith(middle[:k]) for n in names) < SHARED * len(names):
+            break
+        best = k
+    return [n[best:] if n.startswith(middle[:best]) and len(n) > best else n for n in names]
+
+
 def guess(b: bvh.Bvh, joints=None, balls=None):
     """Which joint is which segment, from names along the limbs; the trunk is where the limbs meet.
 
@@ -58,18 +86,39 @@ def guess(b: bvh.Bvh, joints=None, balls=None):
     Returns   joints, balls : completed as far as possible;  missing : segments (and ball_l, ball_r) that were not found
     Test      tests/mocap/test_rigs.py::test_any_rig, ::test_partial_joint_map
     """
+    ways = [_guess(b, [read_name(n) for n in names], joints, balls) for names in (bare_names(b.names), b.names)]
+    return min(ways, key=lambda way: len(way[2]))
+
+
+COINCIDE = 0.01  # of the skeleton's size: joints nearer than that are in one place
+
+
+def _guess(b, named, joints, balls):
     joints = dict(joints or {})
-    named = [read_name(n) for n in b.names]
     index = {n: j for j, n in enumerate(b.names)}
     index |= {f"{n}.end": index[n] for n in b.end_sites}
+    length = np.linalg.norm(b.offsets, axis=-1)
+    length[0] = 0.0
+    tiny = COINCIDE * (length.sum() + 1e-9) / 3  # a third of all bones is about the height
 
+    @cache
     def above(j):
         """Joint j and all that it hangs from."""
         found = set()
         while j >= 0:
             found.add(int(j))
             j = b.parents[j]
-        return found
+        return frozenset(found)
+
+    def distinct(fits):
+        """Of joints of one name the first; of a chain of them in one place the last: it is what turns the bone."""
+        chosen = fits[0]
+        for j in fits[1:]:
+            between = above(j) - above(chosen)
+            here = length[chosen] <= tiny or sum(length[i] for i in between) <= tiny
+            if chosen in above(j) and here:
+                chosen = j
+        return chosen
 
     for side, ball in zip("lr", balls or (None, None)):
         if ball:
@@ -79,35 +128,68 @@ def guess(b: bvh.Bvh, joints=None, balls=None):
             for part in limb:
                 key = f"{part}_{side}"
                 fits = [
-                    j
+                    fits
                     for word in _WORDS[part]
-                    for j, name in enumerate(named)
-                    if name == (side, word) and b.names[j] not in joints.values() and top < above(j)
+                    if (
+                        fits := [
+                            j
+                            for j, name in enumerate(named)
+                            if name == (side, word) and b.names[j] not in joints.values() and top < above(j)
+                        ]
+                    )
                 ]
                 if key not in joints and fits:
-                    joints[key] = b.names[fits[0]]
+                    joints[key] = b.names[distinct(fits[0])]
                 if key in joints:
                     top = above(index[joints[key]])
-        foot = joints.get(f"foot_{side}")
+        foot, ball = joints.get(f"foot_{side}"), joints.get(f"ball_{side}")
+        if foot and ball in b.names and length[index[ball]] <= tiny and not balls:  # toes in the ankle's place
+            del joints[f"ball_{side}"]
+            if np.linalg.norm(b.end_sites.get(ball, np.zeros(3))) > tiny:
+                joints[f"ball_{side}"] = f"{ball}.end"
         if foot and f"ball_{side}" not in joints:  # toes of another name: the foot's only child, or where it ends
-            children = [n for n, p in zip(b.names, b.parents) if b.names[p] == foot and p >= 0]
+            children = [j for j, p in enumerate(b.parents) if p >= 0 and b.names[p] == foot and length[j] > tiny]
             if len(children) == 1:
-                joints[f"ball_{side}"] = children[0]
+                joints[f"ball_{side}"] = b.names[children[0]]
             elif np.linalg.norm(b.end_sites.get(foot, np.zeros(3))) > 0:
                 joints[f"ball_{side}"] = f"{foot}.end"
     for part, limb in (("pelvis", "thigh"), ("chest", "upper_arm")):
         pair = [joints.get(f"{limb}_{side}") for side in "lr"]
         if part not in joints and all(pair):
-            meet = set.intersection(*(above(index[n]) - {index[n]} for n in pair))
+            meet = set.intersection(*(set(above(index[n]) - {index[n]}) for n in pair))
             if meet and b.names[max(meet)] not in joints.values():
                 joints[part] = b.names[max(meet)]
-    trunk = above(index[joints["chest"]]) if "chest" in joints else set()
+    trunk = above(index[joints["chest"]]) if "chest" in joints else frozenset()
     heads = [j for j, (side, word) in enumerate(named) if not side and word.endswith("head") and trunk < above(j)]
     if "head" not in joints and heads:
         joints["head"] = b.names[min(heads, key=lambda j: named[j][1] != "head")]
+    elif "head" not in joints and trunk and (neck := _neck_end(b, named, joints, above, length)):
+        joints["head"] = neck
     balls = tuple(joints.pop(f"ball_{side}", None) for side in "lr")
     missing = [s for s in SEGMENTS if s not in joints] + [f"ball_{s}" for s, n in zip("lr", balls) if not n]
     return {s: joints[s] for s in SEGMENTS if s in joints}, balls, missing
+
+
+NECK = 0.35  # of a shin: what is longer reaches to the top of the head
+
+
+def _neck_end(b, named, joints, above, length):
+    """Where the head sits on a rig that ends at the neck: the neck's End Site, or the neck where that is too far up.
+
+    ASSUMED   the head turns as the neck does
+    Test      tests/mocap/test_mend.py::test_no_head
+    """
+    chest = b.names.index(joints["chest"])
+    limbs = set().union(*(above(b.names.index(n)) for n in joints.values() if n in b.names))
+    free = [j for j, (side, _) in enumerate(named) if not side and j not in limbs and above(chest) < above(j)]
+    neck = free[-1] if free else chest  # of the trunk's joints the last
+    if "neck" not in named[neck][1]:  # a single joint above the arms is the head, whatever its name
+        return b.names[neck] if len(free) == 1 else None
+    end, shin = np.linalg.norm(b.end_sites.get(b.names[neck], np.zeros(3))), joints.get("foot_l")
+    short = shin not in b.names or end <= NECK * length[b.names.index(shin)]
+    if end > 0 and (short or neck == chest):
+        return f"{b.names[neck]}.end"
+    return b.names[neck] if neck != chest else None
 
 
 def read_map(path):
@@ -173,9 +255,9 @@ def _check_map(source, b, joints, balls):
 # ------------------------------------------------------------------------------------ how the axes stand
 
 
-def _unknown(group, reading):
-    """(Rig, name) for files of one skeleton that is in no table."""
-    b, table = group[0], read_map(reading.joint_map) if reading.joint_map else {}
+def _unknown(b, group, reading):
+    """(Rig, name) for a file, and files of its skeleton, that is in no table."""
+    table = read_map(reading.joint_map) if reading.joint_map else {}
     source = reading.joint_map or b.path
     given, ends = table.get("joints", {}), table.get("balls")
     _check_map(source, b, given, ends or (None, None))
@@ -193,34 +275,54 @@ def _unknown(group, reading):
         for s, n in [*joints.items(), *zip(("ball_l", "ball_r"), balls)]
         if s not in given and not (ends and s[:4] == "ball")
     ]
-    say = lambda text: print(printable(f"{b.path}: {text}"), file=sys.stderr)  # noqa: E731
     if pairs:
-        say(f"rig guessed from the joints' names: {', '.join(pairs)}")
+        say(b.path, f"rig guessed from the joints' names: {', '.join(pairs)}", warning=False)
+    if "head" not in given and "head" not in joints["head"].lower():
+        say(b.path, f"no joint for the head: {joints['head']} is taken for it; another: --joint-map")
 
     poses = [_pose(each) for each in group]
     names = poses[0][0]
     at = [names.index(n) for n in (*joints.values(), *balls)]
-    pos = np.concatenate([p[:, at] for _, p, _ in poses])
     up, unit = reading.up or table.get("up"), _unit("", reading.unit or table.get("unit"))
     if not up:
-        up, share = find_up(b.path, pos)
-        say(f"{up} is up: the head is above the feet along it in {100 * share:.0f} % of the frames")
+        up, share = _of_all(b, group, lambda files, path: find_up(path, np.concatenate([p[:, at] for p in files])),
+                            [p for _, p, _ in poses])  # fmt: skip
+        say(b.path, f"{up} is up: the head is above the feet along it in {100 * share:.0f} % of the frames", False)
     order, signs, _ = _from_file(up)
-    pos = pos[..., order] * signs
+    pos = np.concatenate([p[:, at] for _, p, _ in poses])[..., order] * signs
     if not unit:
-        unit, name, hips = find_unit(b.path, pos)
-        say(f"unit {name}: the hips of a standing adult are 0.6 to 1.2 m high, these {hips:.2f} m")
+        unit, name, hips = find_unit(pos)
+        say(b.path, unit_line(unit, name, hips), warning=not name)
     rig = Rig(joints, {}, balls, unit=unit, up=up)
     human = [
         _human(rig, np.tile([1.0, 0, 0, 0], (15, 1)), *p, "", "", 1.0 / e.frame_time) for p, e in zip(poses, group)
     ]
-    try:
-        axes, notes = measure(b.path, human, [_fingers(b, rig, p) for p in poses])
-    except ValueError as e:
-        raise UserError(f"{b.path}: the axes of its segments cannot be measured: {e}; expected a human") from None
+    fingers = [_fingers(b, rig, p) for p in poses]
+    axes, notes = _of_all(b, group, lambda files, path: _measured(path, files), list(zip(human, fingers)))
     for note in notes:
-        say(note)
+        say(b.path, note)
     return replace(rig, axes=axes), Path(reading.joint_map).stem if reading.joint_map else "guessed"
+
+
+def _measured(path, files):
+    """`measure` of (Clip, fingers) pairs, every complaint a UserError."""
+    try:
+        return measure(path, [clip for clip, _ in files], [fingers for _, fingers in files])
+    except ValueError as e:
+        raise UserError(f"{path}: the axes of its segments cannot be measured: {e}; expected a human") from None
+
+
+def _of_all(b, group, what, files):
+    """what(files, path) of all files of a group; if that fails, the file that fails by itself is the one to blame.
+
+    Test      tests/mocap/test_mend.py::test_the_bad_file_is_named"""
+    try:
+        return what(files, b.path)
+    except UserError as error:
+        for each, file in zip(group, files):
+            if len(group) > 1 and each.path != b.path:
+                what([file], each.path)
+        raise error
 
 
 def find_up(path, pos):
@@ -240,27 +342,6 @@ def find_up(path, pos):
     if abs(mean[k]) < 0.6:
         raise UserError(f"{path}: no axis along which the head is above the feet; give --up (valid: {', '.join(UPS)})")
     return up, share
-
-
-def find_unit(path, pos):
-    """The unit in which the hips are as high as a standing adult's.
-
-    Args      pos : (T, 17, 3) segments' joints and balls of the feet, z up, file units
-    Returns   metres a unit, its name, hip height [m]: thigh + shin + the ankle's height over the ball
-    Raises    UserError: no unit fits
-    Test      tests/mocap/test_rigs.py::test_units_and_up
-    """
-    length = lambda a, b: np.linalg.norm(pos[:, SEG[a]] - pos[:, SEG[b]], axis=-1).mean()  # noqa: E731
-    legs = np.mean([length(f"thigh_{s}", f"shin_{s}") + length(f"shin_{s}", f"foot_{s}") for s in "lr"])
-    low = np.percentile(pos[:, [*FEET, 15, 16], 2], 5, axis=0)
-    hips = legs + max(float(np.mean(low[:2] - low[2:])), 0.0)
-    for name, unit in UNITS.items():
-        if HIPS[0] <= hips * unit <= HIPS[1]:
-            return unit, name, hips * unit
-    raise UserError(
-        f"{path}: the hips are {hips:.4g} file units high, in none of {', '.join(UNITS)} an adult's 0.6 to 1.2 m; "
-        "give --unit (one of these, or metres a unit)"
-    )
 
 
 def _fingers(b, rig, pose):

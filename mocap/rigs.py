@@ -15,8 +15,11 @@ A rig's rest pose says nothing here (it may be a T-pose, or bones along x): for 
 
 from __future__ import annotations
 
+import contextlib
+import re
 import sys
-from dataclasses import dataclass, field, replace
+from contextvars import ContextVar
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 
@@ -32,12 +35,14 @@ from human import (
     Clip,
     linear_velocity,
     quat_about,
+    quat_conj,
     quat_continuous,
     quat_mul,
     quat_rotate,
 )
 from mocap import amc, bvh
-from plumbing.cli import UserError
+from mocap.mend import REST_SEEN, doubt_rate, floor_of, leading_rest, may_rest
+from plumbing.cli import UserError, printable
 
 # ------------------------------------------------------------------------------------ known rigs
 
@@ -158,30 +163,41 @@ HIPS = (0.6, 1.2)  # m, height of a standing adult's hips; its ends' ratio is le
 class Reading:
     """What a user says about files, over what is known, guessed or measured; None: nothing.
 
-    Raises    UserError: a unit or an axis that is none
-    Test      tests/mocap/test_rigs.py::test_overrides, ::test_bad_joint_maps
+    Raises    UserError: a unit, an axis, a rate or a word that is none
+    Test      tests/mocap/test_rigs.py::test_overrides, ::test_bad_joint_maps, tests/mocap/test_mend.py::test_flags
     """
 
     joint_map: str | None = None
     unit: str | None = None
     up: str | None = None
+    rate: str | float | None = None
+    floor: str | None = None
+    rest_pose: str | None = None
 
     def __post_init__(self):
         _unit("--unit", self.unit)
         _up("--up", self.up)
+        object.__setattr__(self, "rate", _rate("--rate", self.rate))
+        for name, valid in (("floor", FLOORS), ("rest_pose", REST_POSES)):
+            if (value := getattr(self, name)) not in (None, *valid):
+                raise UserError(f"--{name.replace('_', '-')} {value}: valid: {', '.join(valid)}")
 
     @classmethod
     def of(cls, options) -> Reading:
-        """The same three of a command's options."""
-        return cls(options.joint_map, options.unit, options.up)
+        """The same of a command's options; a command without one of the flags leaves it to the reader."""
+        return cls(**{f.name: getattr(options, f.name, None) for f in fields(cls)})
 
 
 HELP = {  # of the flags that every command with --motion has
     "joint_map": "TOML file that says which joint is which segment, for BVH files of rigs that are neither known nor "
     "guessed",
-    "unit": "length unit of the BVH files: m, cm, mm, in, cmu, or metres a unit; found from the body's size by default",
+    "unit": "length unit of the motion: m, cm, mm, in, cmu, or metres a unit; by default found from the body's size",
     "up": "axis of the BVH files that points up: x, y, z, or --up=-z; found from the body by default",
+    "rate": "frames a second of the motion files, whatever they say themselves",
+    "floor": "what to do where the feet rest more than 6 cm off the floor: level (default), or file to leave it",
+    "rest_pose": "what to do with a rest pose before the motion, a jump away from it: drop (default) or keep",
 }
+FLOORS, REST_POSES = ("level", "file"), ("drop", "keep")
 
 
 def _unit(where, value) -> float | None:
@@ -195,6 +211,18 @@ def _unit(where, value) -> float | None:
     if isinstance(value, bool) or not 1e-6 <= number <= 1e6:
         valid = f"{', '.join(UNITS)}, or metres a unit as a number, 1e-6 to 1e6"
         raise UserError(f"{where} {value!r} is no unit; valid: {valid}")
+    return number
+
+
+def _rate(where, value) -> float | None:
+    """Frames a second."""
+    least, most = (1.0 / t for t in reversed(bvh.FRAME_TIMES))
+    try:
+        number = None if value is None else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = np.nan
+    if number is not None and not least <= number <= most:
+        raise UserError(f"{where} {value!r}: valid: frames a second, {least:g} to {most:g}")
     return number
 
 
@@ -219,6 +247,33 @@ def _from_file(up: str):
     return [(k + 1) % 3, (k + 2) % 3, k], signs, turn
 
 
+# ------------------------------------------------------------------------------------ what is said of a file
+
+_heard: ContextVar[list | None] = ContextVar("heard", default=None)
+
+
+def say(path, text, warning=True) -> None:
+    """One line about a file on stderr; a warning is also kept for whoever listens (`heard`).
+
+    Test      tests/mocap/test_mend.py::test_inspect_json"""
+    print(printable(f"{path}: {text}"), file=sys.stderr)
+    if warning and (kept := _heard.get()) is not None:
+        kept.append((str(path), text))
+
+
+@contextlib.contextmanager
+def heard():
+    """A list that fills with the (path, text) of every warning said inside.
+
+    Test      tests/mocap/test_mend.py::test_inspect_json"""
+    kept = []
+    token = _heard.set(kept)
+    try:
+        yield kept
+    finally:
+        _heard.reset(token)
+
+
 # ------------------------------------------------------------------------------------ reading a file
 
 
@@ -230,16 +285,53 @@ def rig_of(b: bvh.Bvh) -> str | None:
     return None
 
 
-def read(path) -> bvh.Bvh:
-    """A BVH file as it stands; UserError if there is none.  Test: tests/robustness/test_cli.py::test_broken_motion."""
+BONE_OFF = 40.0  # degrees between a bone and where a known rig's table has it: more is another rig of the same names
+
+
+def known_rig(b: bvh.Bvh) -> str | None:
+    """As `rig_of`, if the bones of the limbs lie in their joints' frames as that rig's do.
+
+    Test      tests/mocap/test_mend.py::test_same_names_other_axes"""
+    name = rig_of(b)
+    if not name:
+        return None
+    pos, quat = bvh.global_pose(replace(b, values=b.values[:1]))
+    at = {s: b.names.index(n) for s, n in RIGS[name].joints.items()}
+    for limb in (("thigh", "shin", "foot"), ("upper_arm", "forearm", "hand")):
+        for side in "lr":
+            for upper, lower in zip(limb, limb[1:]):
+                i, j = at[f"{upper}_{side}"], at[f"{lower}_{side}"]
+                bone = quat_rotate(quat_conj(quat[0, i]), pos[0, j] - pos[0, i])
+                up = _axis(RIGS[name].axes[f"{upper}_{side}"][2])
+                if bone @ -up < np.cos(np.radians(BONE_OFF)) * np.linalg.norm(bone):
+                    return None
+    return name
+
+
+def read(path, reading=AS_IT_IS, quiet=False) -> bvh.Bvh:
+    """A BVH file as it stands, a rest pose in front left out, at the rate that the user says.
+
+    Raises    UserError: there is none, or it is malformed
+    Test      tests/robustness/test_cli.py::test_broken_motion, tests/mocap/test_mend.py::test_leading_rest
+    """
     try:
-        b = bvh.read(path)
+        b = bvh.read(path, reading.rate and 1.0 / reading.rate)
     except bvh.BvhError as e:
         raise UserError(str(e)) from None
     except OSError as e:
         raise UserError(f"{path}: {e.strerror or e}; expected a regular .bvh file") from None
     _check_moving(path, len(b.names), b.values.shape[1])
-    return b
+    if reading.rest_pose == "keep" or not may_rest(b.values):
+        return b
+    n = leading_rest(bvh.global_pose(replace(b, values=b.values[:REST_SEEN]))[0])
+    if n and not quiet:
+        say(path, _dropped(n))
+    return replace(b, values=b.values[n:])
+
+
+def _dropped(n) -> str:
+    what = "frame 0 is a rest pose" if n == 1 else f"frames 0 to {n - 1} are a rest pose"
+    return f"{what}, a jump away from the motion: dropped; to keep it: --rest-pose keep"
 
 
 def _check_moving(path, joints, values):
@@ -253,10 +345,7 @@ def is_amc(path) -> bool:
     return Path(path).suffix.lower() == ".amc"
 
 
-FLOOR_LIMIT, BALL_HEIGHT = 0.15, 0.02  # m: beyond the one a file has no floor at 0; the other is a standing ball's
-
-
-def canonical(b: bvh.Bvh, rig: Rig, name: str) -> Clip:
+def canonical(b: bvh.Bvh, rig: Rig, name: str, reading=AS_IT_IS) -> Clip:
     """A file in a rig -> the canonical human.
 
     Test      tests/mocap/test_mocap.py::test_root_offset, tests/mocap/test_rigs.py::test_floor"""
@@ -267,14 +356,66 @@ def canonical(b: bvh.Bvh, rig: Rig, name: str) -> Clip:
         added = _clip_of(b, rig, name, "add")
         if abs(_lowest(added)) < abs(_lowest(pose)):
             pose = added
-    if name not in RIGS and abs(low := _lowest(pose)) > FLOOR_LIMIT:
-        print(f"{b.path}: the balls of the feet stand at {low:.2f} m: moved to the floor", file=sys.stderr)
-        down = np.array([0.0, 0.0, low - BALL_HEIGHT])
-        pose = replace(pose, pos=pose.pos - down, ball=pose.ball - down)
+    if name in RIGS and not reading.unit:
+        pose = _adult(b.path, pose, rig.unit)
+    pose = _on_floor(b.path, pose, reading, all(ball.endswith(".end") for ball in rig.balls))
     if (lean := _lean(pose)) > LYING:
-        print(f"{b.path}: the body is {lean:.0f} degrees off {rig.up}, taken as up; another: --up", file=sys.stderr)
+        say(b.path, f"the body is {lean:.0f} degrees off {rig.up}, taken as up; another: --up")
     _check_size(b.path, pose, "; its unit and up axis can be given as --unit, --up")
+    if not reading.rate and (doubt := doubt_rate(pose)):
+        say(b.path, doubt)
     return replace(pose, body=_body(name, pose))
+
+
+def _on_floor(path, clip, reading, ends=False):
+    """The clip moved up or down so that its feet rest on the floor, and a line about it."""
+    low = 0.0 if reading.floor == "file" else floor_of(clip, ends)
+    if not low:
+        return clip
+    say(path, f"the feet rest {100 * abs(low):.0f} cm {'above' if low > 0 else 'below'} the floor: levelled; "
+        "to leave it: --floor file")  # fmt: skip
+    down = np.array([0.0, 0.0, low])
+    return replace(clip, pos=clip.pos - down, ball=clip.ball - down)
+
+
+ADULT = 0.9  # m, hips of an adult
+
+
+def find_unit(pos):
+    r"""The unit in which the hips are as high as a standing adult's.
+
+    Height    thigh + shin + the ankle's lowest height over the floor: over the file's 0 where the balls rest within a
+              twelfth of the legs' length of it, else over the balls
+    Args      pos : (T, 17, 3) segments' joints and balls of the feet, z up, file units
+    Returns   metres a unit; the unit's name, or None where none fits: then the hips are made 0.9 m high (ASSUMED: of
+              a figure drawn to taste nothing else is known); the hips' height [file units]
+    Test      tests/mocap/test_rigs.py::test_units_and_up, tests/mocap/test_mend.py::test_any_scale
+    """
+    length = lambda a, b: np.linalg.norm(pos[:, SEG[a]] - pos[:, SEG[b]], axis=-1).mean()  # noqa: E731
+    legs = np.mean([length(f"thigh_{s}", f"shin_{s}") + length(f"shin_{s}", f"foot_{s}") for s in "lr"])
+    ankle = np.mean(np.percentile(pos[:, FEET, 2], 5, axis=0))
+    ball = np.mean(np.percentile(pos[:, 15:17, 2], 5, axis=0))
+    hips = float(legs + (ankle if abs(ball) < legs / 12 else max(ankle - ball, 0.0)))
+    for name, unit in UNITS.items():
+        if HIPS[0] <= hips * unit <= HIPS[1]:
+            return unit, name, hips
+    return ADULT / max(hips, 1e-9), None, hips
+
+
+def _adult(path, clip, unit):
+    """A clip that was read in a unit: in another one if its hips are no adult's."""
+    found, name, hips = find_unit(np.concatenate([clip.pos, clip.ball], axis=1) / unit)
+    if HIPS[0] <= hips * unit <= HIPS[1]:
+        return clip
+    say(path, unit_line(found, name, hips), warning=not name)
+    return replace(clip, pos=clip.pos * (found / unit), ball=clip.ball * (found / unit))
+
+
+def unit_line(unit, name, hips) -> str:
+    """What is said of a unit that was found.  Test: tests/mocap/test_mend.py::test_any_scale"""
+    if name:
+        return f"unit {name}: the hips of a standing adult are 0.6 to 1.2 m high, these {hips * unit:.2f} m"
+    return f"hips {hips:.4g} units high: scaled to an adult's {ADULT} m, {unit:.4g} m a unit; another: --unit"
 
 
 LYING = 60.0  # degrees; the most that `find_up` takes for upright is 53
@@ -396,13 +537,13 @@ def cmu_rig(skeleton: amc.Skeleton) -> Rig:
     return Rig(CMU_BONES, axes, ("ltoes", "rtoes"), CMU_PITCH, INCH / skeleton.length)
 
 
-def from_amc(path, rate=AMC_RATE) -> Clip:
+def from_amc(path, reading=AS_IT_IS) -> Clip:
     """Read a CMU motion as the canonical human; its skeleton lies beside it.
 
     Symbols   as in `from_bvh`; unit 0.0254 / (:units length) m; the balls of the feet are where the toes start
     Frame     world, floor at z = 0, metres; made level by `level`
     Args      path : SUBJECT_TRIAL.amc beside SUBJECT.asf, or beside a single .asf of any name
-              rate : [Hz] of the file, which does not hold it; CMU's are 120
+              reading : its rate [Hz] is not in the file; CMU's are 120
     Returns   Clip at that rate, body cmu-SUBJECT with lengths of leg and arm
     Raises    UserError: cannot be opened, malformed, no skeleton beside it, or not CMU's; names what was looked for
     Test      tests/mocap/test_amc.py::test_from_amc_against_matrices, ::test_skeleton_beside, ::test_cmu_anatomy
@@ -410,12 +551,22 @@ def from_amc(path, rate=AMC_RATE) -> Clip:
     s, motion = read_amc(path)
     try:
         rig = cmu_rig(s)
+        rig = replace(rig, unit=_unit("--unit", reading.unit) or rig.unit)
     except ValueError as e:
         raise UserError(f"{s.path}: the axes of its bones make no frame: {e}; expected CMU's bones") from None
     calibrations = np.stack([rig.calibration(segment) for segment in SEGMENTS])
     pose = amc.global_pose(s, motion)
-    clip = level(_human(rig, calibrations, s.names, *pose, Path(path).stem, "", float(rate)))
-    _check_size(path, clip, f"; the unit is that of {Path(s.path).name}: 1 / (length of :units) inches")
+    clip = _human(rig, calibrations, s.names, *pose, Path(path).stem, "", reading.rate or AMC_RATE)
+    n = leading_rest(clip.pos) if reading.rest_pose != "keep" else 0
+    if n:
+        say(path, _dropped(n))
+        clip = clip[n:]
+    if not reading.unit:
+        clip = _adult(path, clip, rig.unit)
+    clip = _on_floor(path, level(clip), reading)
+    _check_size(path, clip, f"; the unit is that of {Path(s.path).name}: 1 / (length of :units) inches, or --unit")
+    if not reading.rate and (doubt := doubt_rate(clip)):
+        say(path, doubt)
     return replace(clip, body=_body(f"cmu-{Path(s.path).stem}", clip))
 
 
@@ -450,18 +601,36 @@ def level(clip: Clip) -> Clip:
     return replace(clip, pos=quat_rotate(q, clip.pos), ball=quat_rotate(q, clip.ball), quat=quat_mul(q, clip.quat))
 
 
+def skeleton_beside(path):
+    """The .asf files that may belong to an .amc file, best first; those equally good are all given.
+
+    Rule      SUBJECT.asf for SUBJECT_TRIAL.amc; else the longest name with which the motion's begins; else, for
+              `09_06-run.amc`, those of subject 09 (`09-run.asf`), of several those with the same suffix; else a single
+              one of any name
+    Test      tests/mocap/test_amc.py::test_skeleton_beside, tests/mocap/test_mend.py::test_skeletons_with_suffixes
+    """
+    beside = sorted(f for f in path.parent.glob("*") if f.suffix.lower() == ".asf")
+    stem, words = path.stem.lower(), lambda name: re.findall(r"[^\W_]+", name.lower())
+    subject = stem.rpartition("_")[0] or stem
+    found = [f for f in beside if f.stem.lower() == subject]
+    begins = [f for f in beside if re.match(re.escape(f.stem.lower()) + r"(?![^\W_])", stem)]
+    found = found or [f for f in begins if len(f.stem) == max(len(g.stem) for g in begins)]
+    found = found or [f for f in beside if words(f.stem)[:1] == words(stem)[:1]]
+    same = [f for f in found if words(f.stem)[1:] and words(f.stem)[1:] == words(stem)[-len(words(f.stem)[1:]) :]]
+    return same if len(found) > 1 and same else found or beside
+
+
 def read_amc(path):
     """Skeleton and motion of an .amc file."""
     path = Path(path)
-    beside = sorted(f for f in path.parent.glob("*") if f.suffix.lower() == ".asf")
-    subject = path.stem.rpartition("_")[0] or path.stem
-    skeleton = [f for f in beside if f.stem == subject] or beside
+    skeleton = skeleton_beside(path)
     try:
         if path.exists() and len(skeleton) != 1:
-            found = ", ".join(f.name for f in beside[:6]) or "none"
+            subject = path.stem.rpartition("_")[0] or path.stem
+            found = ", ".join(f.name for f in sorted(path.parent.glob("*")) if f.suffix.lower() == ".asf") or "none"
             raise UserError(
                 f"{path}: no skeleton beside it: looked for {subject}.asf or a single .asf in {path.parent}; "
-                f"there is {found}"
+                f"there is {found[:200]}"
             )
         s = amc.read_asf(skeleton[0]) if skeleton else None
         motion = amc.read_amc(path, s)

@@ -249,7 +249,7 @@ MALFORMED_ASF = {  # name: (text, what the message must say)
     "another format": ("HIERARCHY\nROOT a\n", "line 1: not an ASF: starts with 'HIERARCHY'"),
     "binary": (b":units\n\x00\x01", "binary data"),
     "utf-16": (SMALL.encode("utf-16"), "UTF-16"),
-    "junk": (b"\x89PNG\r\n\x1a\n\xff\xfe", "line 1: byte 0x89 is not UTF-8"),
+    "junk": (b"\x89PNG\r\n\x1a\n\xff\xfe", "line 1: not an ASF: starts with"),
     "no bones": (HEADER, "no :bonedata section; expected :units, :root, :bonedata, :hierarchy"),
     "no root": (asf_swap(":root", ":skin"), "no :root section"),
     "unknown section": (asf_swap(":root", ":roots"), "unknown section ':roots'; valid: :version"),
@@ -319,7 +319,7 @@ MALFORMED_AMC = {
     "empty": (" \n", "empty"),
     "only comments": ("# nothing\n", "holds no frame"),
     "binary": (b"1\nroot \x00", "binary data"),
-    "junk": (b"1\nroot \xff\xfe", "line 2: byte 0xff is not UTF-8"),
+    "junk": (b"1\nroot \xff\xfe", "line 2: root has 1 values in frame 1"),
     "no frames": (MOTION[: MOTION.index("7\n")], "holds no frame"),
     "bone before a frame": (amc_swap("7\n", ""), "line 4: found 'root'; expected :FULLY-SPECIFIED, :DEGREES, :RADIANS"),
     "unknown keyword": (amc_swap(":DEGREES", ":DEGREE"), "line 3: unknown keyword ':DEGREE'; valid: :FULLY-SPECIFIED"),
@@ -584,6 +584,9 @@ def test_zero_pose_is_a_t_pose(tmp_path):
     np.testing.assert_allclose(clip.pos[0, SEG["head"]], [0, 0, 0.95 + 0.6], atol=1e-9)
 
 
+AS_THE_FILE = rigs.Reading(floor="file")  # the person in these files stands 8 cm too low
+
+
 def test_standing_is_the_worlds_axes(tmp_path):
     """Upright with hanging arms every frame is the world's; flexion is about the left axis: knees +, elbows -."""
     bent = {**standing()}
@@ -593,7 +596,7 @@ def test_standing_is_the_worlds_axes(tmp_path):
         elbow = chain("xyz", np.radians([180, -30 * k, -90 * k]))
         bent[f"{side}radius"] = elbow @ turn("x", np.radians(50)) @ elbow.T
     path, _, motion = cmu_file(tmp_path, [standing(), standing(), bent])
-    clip = rigs.from_amc(path)
+    clip = rigs.from_amc(path, AS_THE_FILE)
     assert quat_angle(clip.quat[:2], [1.0, 0, 0, 0]).max() < 1e-5
     for side, k in (("l", 1), ("r", -1)):
         np.testing.assert_allclose(clip.pos[0, SEG[f"foot_{side}"]], [0, k * 0.09, 0.83 - 0.85], atol=1e-5)
@@ -633,7 +636,7 @@ def slow_human(s, row):
 
 def check_clip(path, s, motion, frames):
     """from_amc but for `level`, against matrices."""
-    clip = rigs.from_amc(path)
+    clip = rigs.from_amc(path, AS_THE_FILE)
     assert len(clip) == len(motion)
     for t in frames:
         metres, turns = slow_human(s, motion[t])
@@ -675,10 +678,10 @@ def test_unknown_skeleton(tmp_path):
         rigs.from_amc(path)
 
 
-def test_skeleton_beside(tmp_path):
+def test_skeleton_beside(tmp_path, capsys):
     """SUBJECT.asf, or the only one there; else the message names what was looked for."""
     path, *_ = cmu_file(tmp_path, [standing()] * 2)
-    assert rigs.from_amc(path).body.startswith("cmu-16-") and rigs.from_amc(path, 60.0).rate == 60.0
+    assert rigs.from_amc(path).body.startswith("cmu-16-") and rigs.from_amc(path, rigs.Reading(rate=60)).rate == 60.0
     (tmp_path / "07.asf").write_text(cmu_asf())
     assert rigs.from_amc(path).body.startswith("cmu-16-")  # its own among two
     (tmp_path / "16.asf").rename(tmp_path / "somebody.ASF")
@@ -693,9 +696,10 @@ def test_skeleton_beside(tmp_path):
     assert "looked for 16.asf or a single .asf" in m and "07.asf, somebody.ASF" in m and "16_01.amc" in m
     (tmp_path / "07.asf").unlink()
     (tmp_path / "somebody.ASF").write_text(re.sub(r"(:units\s.*?length )\S+", r"\g<1>4500", cmu_asf(), flags=re.S))
-    m = message(path)  # a ten thousandth of its size; what a BVH's flags say is no help
-    assert "above the floor; valid: 0.1 to 10 m; the unit is that of somebody.ASF: 1 / (length of :units)" in m
-    assert "--unit" not in m
+    rigs.from_amc(path)  # a ten thousandth of its size: made an adult's, unless the user says more
+    assert ": unit " in capsys.readouterr().err
+    with pytest.raises(UserError, match=r"above the floor; valid: 0.1 to 10 m; .* somebody.ASF: 1 / \(length"):
+        rigs.from_amc(path, rigs.Reading(unit="1e-4"))
     (tmp_path / "somebody.ASF").write_text(cmu_asf())
     assert rigs.from_amc(path).body == "cmu-somebody-leg85-arm60"
     (tmp_path / "somebody.ASF").unlink()
@@ -769,7 +773,7 @@ def test_body_split(tmp_path, capsys):
     assert split_of("train/16_01.amc") == "train" and split_of("a/validation/walk_001.bvh") == "validation"
 
     def load(where, split, **kw):
-        return [c.name for c in mocap.data.load(where, split=split, **kw)]
+        return [c.name for c in mocap.data.load(where, split=split, reading=AS_THE_FILE, **kw)]
 
     assert load(folder, "body") == load(folder, "all") == ["16_01", "16_02", "16_05"]
     assert capsys.readouterr().err == ""

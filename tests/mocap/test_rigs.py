@@ -383,7 +383,7 @@ def test_overrides(tmp_path, capsys):
 
 
 def test_units_and_up(tmp_path, capsys):
-    """People of 1.3 to 2.1 m in every unit; a giant, and somebody who somersaults, need to be told about."""
+    """People of 1.3 to 2.1 m in every unit; a giant is made an adult; one who somersaults needs to be told about."""
     for name, unit in rigs.UNITS.items():
         for height in (1.3, 2.1):
             clip = augment.resize(walk(1.0), height / 1.75)
@@ -392,8 +392,8 @@ def test_units_and_up(tmp_path, capsys):
             np.testing.assert_allclose(got.limb("thigh_l", "shin_l"), clip.limb("thigh_l", "shin_l"), rtol=1e-4)
             assert f"unit {name}: " in capsys.readouterr().err
     write_rig(tmp_path / "a.bvh", augment.resize(walk(1.0), 3.0), "games105")
-    with pytest.raises(UserError, match="file units high, in none of m, cm, mm, in, cmu .* give --unit"):
-        data.from_bvh(tmp_path / "a.bvh")
+    assert data.from_bvh(tmp_path / "a.bvh").hip_height == pytest.approx(0.9, abs=0.01)
+    assert "units high: scaled to an adult's 0.9 m, " in capsys.readouterr().err
     clip = walk(2.0)
     over = Rotation.from_euler("y", np.linspace(0, 2 * np.pi, len(clip))[:, None])
     pos = np.stack([over.apply(clip.pos[:, s]) for s in range(15)], axis=1)
@@ -416,9 +416,9 @@ def test_swapped_sides(tmp_path):
 def test_floor(tmp_path, capsys):
     """A file whose origin is not on the floor: the feet are put there, and it is said."""
     clip = walk(2.0)
-    for height in (-0.9, 0.0, 2.0):
+    for height in (-0.9, -0.2, -0.11, 0.0, 0.11, 0.2, 2.0):
         up = np.array([0.0, 0.0, height])
         write_rig(tmp_path / "a.bvh", replace(clip, pos=clip.pos + up, ball=clip.ball + up), "rokoko")
         got = data.from_bvh(tmp_path / "a.bvh")
-        assert ("moved to the floor" in capsys.readouterr().err) == bool(height)
+        assert ("the feet rest" in capsys.readouterr().err) == bool(height)
         np.testing.assert_allclose(got.pos, clip.pos, atol=0.02)
