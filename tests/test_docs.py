@@ -440,8 +440,8 @@ ORDER = (  # a module imports only what stands on a line above its own, or in it
     ("env",),
     ("policy",),
     ("ppo", "headset"),
-    ("play",),
     ("metrics",),
+    ("play",),
     ("characters", "drop", "skeletal"),
     ("extras",),
 )
