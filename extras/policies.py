@@ -96,11 +96,13 @@ def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     except (KeyError, TypeError) as e:
         raise UserError(f"{run}: does not say how it was trained ({e}); valid: a folder that ppo.py wrote") from None
     sets = data.parts(motion)
+    sets += [str(meta["options"]["players"])] if meta["options"].get("players") else []
     licences = [f"weights trained on {text}" for text in data.licences(sets)]
     if "licence" in meta:  # was shipped before
         licences = [str(meta["licence"])] if meta["licence"] != "MIT" else []
     kept = {"policy": meta["policy"], "steps": total_steps(meta), "data": meta["data"]}
-    kept["options"] = meta["options"] | {"motion": ",".join(Path(s).name for s in sets), "out": None, "init": None}
+    kept["options"] = meta["options"] | {"motion": ",".join(map(data.set_name, sets)), "out": None, "init": None}
+    kept["options"] |= {"players": None}  # among the motions now
     policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})
     kept |= {"gain": gain} if gain != 1.0 else {}
     if blend:

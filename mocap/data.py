@@ -114,17 +114,26 @@ def parts(motion) -> list[str]:
 
 
 def licences(sets) -> list[str]:
-    """Of each data set that is not built in: its name, and the first line of the licence file beside it.
+    """Of each data set that is not built in: its name, and the first line of the licence file in it, or above its part.
 
     Test      tests/mocap/test_mocap.py::test_licences, tests/extras/test_policies.py::test_ship
     """
     out = []
     for path in (Path(s) for s in sets if s not in BUILTIN):
-        notes = sorted(path.glob("LICENSE*")) if path.is_dir() else []
+        whole = path.parent if path.name in ("train", "validation") else path
+        notes = [note for folder in (path, whole) if folder.is_dir() for note in sorted(folder.glob("LICENSE*"))]
         text = notes[0].read_text(errors="replace") if notes else "no licence file beside the motion"
         title = text.strip().split("\n")[0]
-        out.append(f"{path.name}, licensed: {title}")
+        out.append(f"{set_name(path)}, licensed: {title}")
     return out
+
+
+def set_name(motion) -> str:
+    """A data set's name without where it lies: of a part of it, both.
+
+    Test      tests/mocap/test_mocap.py::test_licences"""
+    path = Path(motion)
+    return f"{path.parent.name}/{path.name}" if path.name in ("train", "validation") else path.name
 
 
 def files_of(path: Path) -> list[Path]:

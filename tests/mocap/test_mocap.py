@@ -788,6 +788,9 @@ def test_licences(tmp_path):
         "b.bvh, licensed: no licence file beside the motion",
     ]
     assert data.licences(["builtin", "standing"]) == []
+    (tmp_path / "a" / "train").mkdir()
+    assert data.licences([tmp_path / "a" / "train"]) == ["a/train, licensed: Non-commercial."]
+    assert data.set_name(tmp_path / "a" / "train") == "a/train" and data.set_name("builtin") == "builtin"
 
 
 def test_builtin(library):
