@@ -1,0 +1,91 @@
+"""What Python computes, for the tests of the page: JSON on standard output.
+
+python web/test/expected.py loop CSV        each character: physics under given controls, first tick, 20 s in closed loop
+python web/test/expected.py stream CSV ...  each file: the ticks, or the complaint
+python web/test/expected.py bvh FILE        names, frames, and where the root is
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+import character  # noqa: E402
+from headset.calibration import Stream  # noqa: E402
+from headset.player import Player, drive  # noqa: E402
+from headset.reader import Reader, lines_of  # noqa: E402
+from mocap.bvh import read  # noqa: E402
+from plumbing.cli import UserError  # noqa: E402
+from ppo import load_policy, sensors_of, trained_as  # noqa: E402
+from web.export import NAMES  # noqa: E402
+
+STEPS, SECONDS = 240, 20.0
+
+
+def physics(char):
+    """240 steps from the default pose under sinusoidal controls."""
+    m, data = char.model, mujoco.MjData(char.model)
+    m.opt.timestep = 1 / 120
+    data.qpos[2], data.qpos[3:7], data.qpos[7:] = char.hip_height, char.rest[char.root], char.default
+    start = data.qpos.copy()
+    t, k = np.arange(STEPS)[:, None] / 120, np.arange(m.nu)
+    controls = 0.1 * np.sin(2 * np.pi * (0.5 + 0.1 * k) * t + k)
+    for row in controls:
+        data.ctrl[:] = row
+        mujoco.mj_step(m, data)
+    return dict(start=start.tolist(), controls=controls.tolist(), qpos=data.qpos.tolist(), qvel=data.qvel.tolist())
+
+
+def loop(path):
+    """Every character under one recording."""
+    out = {}
+    for name in NAMES:
+        shipped = character.CHARACTERS / f"{name}.npz"
+        policy, meta = load_policy(shipped)
+        char = trained_as(meta, shipped).load()
+        entry = {"physics": physics(char)}
+        devices = 1 if sensors_of(meta, shipped) == "hmd" else 3
+        player, roots = Player(char, policy.mean_action, devices=devices), []
+
+        def see(player, tick, entry=entry, roots=roots):
+            if not roots:
+                entry["obs"], entry["action"] = player.obs[0].tolist(), player.act(player.obs)[0].tolist()
+            roots.append(player.qpos[0, :3].tolist())
+
+        stream = Stream(char, "openxr", devices=devices)
+        drive(stream, Reader(path, devices=devices).read(lines_of(path)), player, SECONDS, see=see)
+        c = stream.calibration
+        entry["calibration"] = [c.height, c.floor, c.yaw, *c.origin.tolist(), *c.scale.tolist()]
+        out[name] = entry | {"roots": roots, "ends": {k: player.ends[0][k] for k in player.ENDS}}
+    return out
+
+
+def stream(paths):
+    """The ticks of each file, for Jesse: [[pos, quat] ...], or why there are none."""
+    char, out = character.load("jesse"), []
+    for path in paths:
+        try:
+            source, reader = Stream(char, "unity"), Reader("FILE")
+            ticks = [tick for s in reader.read(lines_of(path)) for tick in source.push(s)]
+            if source.calibration is None:
+                raise UserError(f"FILE: {source.uncalibrated()}")
+            out.append({"ticks": [np.concatenate([t.pos.ravel(), t.quat.ravel()]).tolist() for t in ticks]})
+        except UserError as error:
+            out.append({"error": str(error)})
+    return out
+
+
+def bvh(path):
+    motion = read(path)
+    return {"names": motion.names, "frames": len(motion.values), "first": motion.values[0, :3].tolist()}
+
+
+if __name__ == "__main__":
+    command, *paths = sys.argv[1:]
+    results = {"loop": lambda: loop(paths[0]), "stream": lambda: stream(paths), "bvh": lambda: bvh(paths[0])}
+    json.dump(results[command](), sys.stdout)
