@@ -74,7 +74,12 @@ function licences() {
 async function main() {
   rmSync(from('dist'), { recursive: true, force: true });
   mkdirSync(from('dist/data'), { recursive: true });
-  execFileSync(python, ['-m', 'web', 'export'], { cwd: from('..'), stdio: ['ignore', 'inherit', 'inherit'] });
+  try {
+    execFileSync(python, ['-m', 'web', 'export'], { cwd: from('..'), stdio: ['ignore', 'inherit', 'inherit'] });
+  } catch {
+    console.error(`build: \`${python} -m web export\` failed; PYTHON=… names the Python that has mujoco`);
+    process.exit(1);
+  }
   await bundle([from('src/main.js'), from('src/worker.js')], from('dist'));
   cpSync(from('page'), from('dist'), { recursive: true });
   cpSync(from('node_modules/@mujoco/mujoco/mujoco.wasm'), from('dist/mujoco.wasm'));

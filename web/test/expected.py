@@ -52,7 +52,11 @@ def loop(path):
         devices = 1 if sensors_of(meta, shipped) == "hmd" else 3
         player, roots = Player(char, policy.mean_action, devices=devices), []
 
-        def see(player, tick, entry=entry, roots=roots):
+        count, when = player.ends[0].copy(), []
+
+        def see(player, tick, entry=entry, roots=roots, count=count, when=when):
+            when += [(len(roots), k) for k in player.ENDS if player.ends[0][k] > count[k]]
+            count.update(player.ends[0] - count)
             if not roots:
                 entry["obs"], entry["action"] = player.obs[0].tolist(), player.act(player.obs)[0].tolist()
             roots.append(player.qpos[0, :3].tolist())
@@ -61,7 +65,7 @@ def loop(path):
         drive(stream, Reader(path, devices=devices).read(lines_of(path)), player, SECONDS, see=see)
         c = stream.calibration
         entry["calibration"] = [c.height, c.floor, c.yaw, *c.origin.tolist(), *c.scale.tolist()]
-        out[name] = entry | {"roots": roots, "ends": {k: player.ends[0][k] for k in player.ENDS}}
+        out[name] = entry | {"roots": roots, "when": when, "ends": {k: player.ends[0][k] for k in player.ENDS}}
     return out
 
 

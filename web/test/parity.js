@@ -24,14 +24,16 @@ export async function parity(name, expected, text, seconds) {
   const stream = new Stream(sim.table, { axes: 'openxr', devices: player.devices });
   const roots = [];
   const costs = [];
+  const when = [];
   loop: for (const sample of new Reader('demo', player.devices).read(linesOf(text))) {
     for (const tick of stream.push(sample)) {
       const before = performance.now();
-      player.step(tick);
+      const end = player.step(tick);
       costs.push(performance.now() - before);
       if (!roots.length) {
         Object.assign(out, { obs: furthest(expected.obs, player.obs), action: furthest(expected.action, player.action) });
       }
+      if (end) when.push([roots.length, end]);
       roots.push(Array.from(sim.qpos.subarray(0, 3)));
       if (roots.length >= 30 * seconds) break loop;
     }
@@ -41,7 +43,7 @@ export async function parity(name, expected, text, seconds) {
   out.apart = roots.map((r, i) => Math.hypot(...r.map((x, k) => x - expected.roots[i][k])));
   out.finite = roots.flat().every(Number.isFinite);
   out.ends = { ...player.ends };
-  out.costs = costs;
+  Object.assign(out, { costs, when });
   sim.delete();
   return out;
 }

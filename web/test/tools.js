@@ -1,7 +1,7 @@
 // What the tests share: Python, the server, the browser.
 
 import { execFileSync, spawn } from 'node:child_process';
-import { cpSync, existsSync, mkdtempSync, rmSync } from 'node:fs';
+import { cpSync, existsSync, mkdtempSync, rmSync, writeFileSync } from 'node:fs';
 import { tmpdir } from 'node:os';
 import { dirname, join } from 'node:path';
 import { fileURLToPath } from 'node:url';
@@ -24,9 +24,15 @@ export async function serve() {
   const folder = mkdtempSync(join(tmpdir(), 'page-'));
   cpSync(join(web, 'dist'), folder, { recursive: true });
   await bundle([join(web, 'test/parity.js')], folder);
+  const empty = '<!doctype html><link rel="icon" href="data:,"><script type="module" src="parity.js"></script>';
+  writeFileSync(join(folder, 'parity.html'), empty);
   const server = spawn(python, ['-m', 'web', 'serve', '--port', '0', '--folder', folder], { cwd: root });
   const url = await new Promise((resolve, reject) => {
-    server.stdout.on('data', (data) => resolve(String(data).match(/http\S+/)[0]));
+    let said = '';
+    server.stdout.on('data', (data) => {
+      said += data;
+      if (said.includes('\n')) resolve(said.match(/http\S+/)[0]);
+    });
     server.stderr.on('data', (data) => reject(new Error(String(data))));
   });
   return { url, close: () => { server.kill(); rmSync(folder, { recursive: true }); } };
