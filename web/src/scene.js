@@ -114,9 +114,9 @@ export class View {
     this.scene.add(this.sun, this.sun.target);
     this.floor = new THREE.Group();
     const ground = new THREE.Mesh(new THREE.PlaneGeometry(60, 60).rotateX(-Math.PI / 2),
-      new THREE.MeshLambertMaterial({ color: 0xe9eef0 }));
+      new THREE.MeshLambertMaterial({ color: 0xb3c4d0 }));
     ground.receiveShadow = true;
-    const grid = new THREE.GridHelper(60, 60, 0x9fb4c4, 0xc4d2dc);
+    const grid = new THREE.GridHelper(60, 60, 0x8fa5b6, 0xa3b6c4);
     grid.position.y = 0.002;
     this.floor.add(ground, grid);
     this.scene.add(this.floor);
