@@ -152,6 +152,7 @@ DEMO = (  # kind, seconds made, seconds kept at least, parameters: somebody stan
     ("jog", 8.0, 4.0, {"speed": 2.2, "turn_rate": 0.25}),
     ("walk", 6.0, 2.0, {"speed": 1.3}),
     ("stop", 9.0, 5.0, {"speed": 1.1}),
+    ("stand", 4.0, 3.0, {}),
 )
 DEMO_SEED = 3
 

@@ -327,7 +327,7 @@ async function start() {
   playDemo();
   const vr = await supported();
   $('enter').disabled = !vr;
-  $('enter').textContent = vr ? 'Enter VR' : 'VR: open this page in a headset';
+  $('enter').textContent = vr ? 'Enter VR' : 'VR: open in a headset';
 }
 
 start().catch((error) => say(error.message));

@@ -49,6 +49,22 @@ function frameOf(colour, size) { // a device: a small block and its three axes
   return group;
 }
 
+function checkered(light, dark, times) { // squares of 1 m, so that steps can be seen
+  const canvas = Object.assign(document.createElement('canvas'), { width: 128, height: 128 });
+  const c = canvas.getContext('2d');
+  c.fillStyle = light;
+  c.fillRect(0, 0, 128, 128);
+  c.fillStyle = dark;
+  c.fillRect(0, 0, 64, 64);
+  c.fillRect(64, 64, 64, 64);
+  const texture = new THREE.CanvasTexture(canvas);
+  texture.wrapS = texture.wrapT = THREE.RepeatWrapping;
+  texture.repeat.set(times, times);
+  texture.anisotropy = 8;
+  texture.colorSpace = THREE.SRGBColorSpace;
+  return texture;
+}
+
 class Body { // one copy of the character, in a group of its own
   constructor(root) {
     this.group = new THREE.Group();
@@ -114,11 +130,9 @@ export class View {
     this.scene.add(this.sun, this.sun.target);
     this.floor = new THREE.Group();
     const ground = new THREE.Mesh(new THREE.PlaneGeometry(60, 60).rotateX(-Math.PI / 2),
-      new THREE.MeshLambertMaterial({ color: 0xb3c4d0 }));
+      new THREE.MeshLambertMaterial({ map: checkered('#b9c9d4', '#aabcc9', 30) }));
     ground.receiveShadow = true;
-    const grid = new THREE.GridHelper(60, 60, 0x8fa5b6, 0xa3b6c4);
-    grid.position.y = 0.002;
-    this.floor.add(ground, grid);
+    this.floor.add(ground);
     this.scene.add(this.floor);
   }
 
@@ -186,7 +200,8 @@ export class View {
   #light(at) {
     this.sun.position.set(at.x - 2, 5.5, at.z - 1.5);
     this.sun.target.position.set(at.x, 0, at.z);
-    this.floor.position.set(Math.round(at.x), this.floor.position.y, Math.round(at.z)); // the grid seems to stand still
+    const even = (v) => 2 * Math.round(v / 2);
+    this.floor.position.set(even(at.x), this.floor.position.y, even(at.z)); // its squares seem to stand still
   }
 
   // ---- places

@@ -22,7 +22,7 @@ let source = null; // { kind: file or live, stream, … }
 let recording = null; // { samples, frames, axes }
 let [paused, speed] = [false, 1];
 let due = 0; // ms, when the next tick of a file is to be played
-let lastSample = 0; // ms, of a live headset
+let [lastSample, lastIdle] = [0, 0]; // ms, of a live headset: its last row, and the last time that none came
 let costs = []; // ms of the last control steps
 
 const wall = (now) => performance.timeOrigin + now; // the page's clock
@@ -129,9 +129,12 @@ function clock() {
         due += PERIOD / speed;
       }
       wait = Math.max(0, due - performance.now());
-    } else if (source?.kind === 'live' && now - lastSample > GAP * 1000) { // reader.arriving: nothing comes
-      for (const tick of source.stream.idle((now - lastSample) / 1000)) step(tick, null);
-      lastSample = now - GAP * 1000 + PERIOD;
+    } else if (source?.kind === 'live') { // reader.arriving: nothing comes, first for GAP, then every PERIOD
+      const silent = now - Math.max(lastSample, lastIdle);
+      if (silent > (lastIdle > lastSample ? PERIOD : GAP * 1000)) {
+        lastIdle = now;
+        for (const tick of source.stream.idle(silent / 1000)) step(tick, null);
+      }
     } else {
       due = now;
     }

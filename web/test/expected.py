@@ -1,8 +1,8 @@
 """What Python computes, for the tests of the page: JSON on standard output.
 
-python web/test/expected.py loop CSV        each character: physics under given controls, first tick, 20 s in closed loop
-python web/test/expected.py stream CSV ...  each file: the ticks, or the complaint
-python web/test/expected.py bvh FILE        names, frames, and where the root is
+python web/test/expected.py loop CSV       each character: physics under given controls, first tick, 20 s of closed loop
+python web/test/expected.py stream CSV ... each file: the ticks, or the complaint
+python web/test/expected.py bvh FILE       names, frames, and where the root is
 """
 
 import json
@@ -85,6 +85,7 @@ def stream(paths):
 
 
 def bvh(path):
+    """What a BVH file of ours holds, to our own reader."""
     motion = read(path)
     return {"names": motion.names, "frames": len(motion.values), "first": motion.values[0, :3].tolist()}
 
