@@ -113,7 +113,7 @@ export class View {
     this.rope.frustumCulled = false;
     this.rope.visible = false;
     this.scene.add(this.rope);
-    this.material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.75 });
+    this.material = new THREE.MeshLambertMaterial({ vertexColors: true });
     this.states = [];
     this.height = 1.6;
     this.screenPlaces();
@@ -142,6 +142,7 @@ export class View {
     for (const body of [this.actor, this.second]) body.build(geometries, this.material);
     this.states = [];
     this.placed = false;
+    this.fresh = true;
   }
 
   // A state of the worker; the picture goes from the last one to this one until the next one comes.
@@ -185,16 +186,24 @@ export class View {
   // The camera keeps its distance and direction while the character walks.
   follow(root, now) {
     const at = this.rootOf(root);
-    const wanted = new THREE.Vector3(at.x, this.height * 0.52, at.z);
+    const wanted = new THREE.Vector3(at.x, this.height * 0.42, at.z);
     const gap = wanted.sub(this.controls.target);
     const share = this.placed && gap.length() < 3 ? 1 - Math.exp(-(now - (this.followed ?? now)) / 250) : 1;
     this.followed = now;
     this.placed = true;
+    if (this.fresh) this.#approach();
     gap.multiplyScalar(share);
     this.controls.target.add(gap);
     this.camera.position.add(gap);
     this.controls.update();
     this.#light(at);
+  }
+
+  #approach() { // a new character: as far away as its size asks for
+    this.fresh = false;
+    const { target } = this.controls;
+    const away = this.camera.position.clone().sub(target).setLength(2.4 + this.height);
+    this.camera.position.copy(target).add(away);
   }
 
   #light(at) {

@@ -1,4 +1,4 @@
-// node test/shots.js FOLDER: pictures of the page, to look at.
+// node test/shots.js FOLDER: pictures of the page, to look at, and README's.
 
 import { join } from 'node:path';
 import { browser, open, serve, sleep, until, CHARACTERS } from './tools.js';
@@ -16,5 +16,9 @@ for (const name of CHARACTERS) {
     await page.close();
   }
 }
+const { page } = await open(chrome, server.url, { width: 960, height: 540 });
+await page.goto(server.url);
+await until(page, () => globalThis.app?.firstPicture && globalThis.app.ticks > 260);
+await page.screenshot({ path: join(folder, 'screenshot.png') });
 await chrome.close();
 server.close();
