@@ -18,9 +18,9 @@ from headset.calibration import Stream
 from headset.reader import Reader, to_world
 from human import heading, quat_angle, sensors
 from plumbing.cli import UserError, run_main
-from ppo import load_policy
 from web import __main__ as commands
 from web import export, serve
+from web.export import load_policy
 
 ROOT = Path(__file__).resolve().parents[2]
 

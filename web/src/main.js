@@ -11,10 +11,11 @@ const MIRROR = 0.95; // m from the user to the mirror
 const app = { falls: 0, ticks: 0, end: null, ready: false, error: null }; // for the console and the tests
 globalThis.app = app;
 
+// The worker first: it fetches and compiles MuJoCo while the picture is set up.
+const worker = new Worker(new URL('./worker.js', import.meta.url), { type: 'module' });
 const view = new View($('picture'));
 const panel = new Panel();
 view.scene.add(panel.mesh);
-const worker = new Worker(new URL('./worker.js', import.meta.url), { type: 'module' });
 const send = (type, fields = {}) => worker.postMessage({ type, ...fields });
 app.send = send;
 
@@ -50,7 +51,7 @@ function statusLine() {
   if (ends.bad) parts.push(`${ends.bad} diverged`);
   const sorted = [...delays].sort((a, b) => a - b);
   if (sorted.length) parts.push(`latency ${sorted[sorted.length >> 1].toFixed(0)} ms`);
-  parts.push(`${frames.rate.toFixed(0)} pictures/s`);
+  parts.push(`${times(Math.round(frames.rate), 'picture', 'pictures')}/s`);
   const lost = ['headset', 'left controller', 'right controller'].filter((_, i) => app.state.lost[i]);
   if (lost.length && app.state.sensors) parts.push(`not tracked: ${lost.join(', ')}`);
   return parts.join(' · ');
@@ -188,8 +189,9 @@ async function enter() {
   session.addEventListener('end', leave);
   session.addEventListener('select', () => send('reset')); // trigger
   session.addEventListener('squeezestart', () => recalibrate());
-  [mode, calibration, slow] = ['live', null, false];
+  [mode, calibration, slow, paused] = ['live', null, false, false];
   send('speed', { factor: 1 });
+  send('pause', { on: false });
   send('live');
   panel.mesh.visible = true;
   view.renderer.xr.setReferenceSpaceType('local-floor');
@@ -209,7 +211,7 @@ function leave() {
   view.controls.target.set(0, 0, 0);
   $('enter').textContent = 'Enter VR';
   $('calibrating').hidden = true;
-  view.resize();
+  resize();
   playDemo();
 }
 
@@ -275,7 +277,14 @@ addEventListener('drop', (event) => {
   const file = event.dataTransfer.files[0];
   if (file) playFile(file);
 });
-addEventListener('resize', () => view.resize());
+function resize() { // the panels lie over the picture
+  const [above, below] = [document.querySelector('header'), document.querySelector('footer')]
+    .map((panel) => panel.getBoundingClientRect());
+  const beside = above.width < 0.5 * window.innerWidth;
+  view.resize({ left: beside ? above.right : 0, right: window.innerWidth, top: beside ? 0 : above.bottom, bottom: below.top });
+}
+addEventListener('resize', resize);
+for (const panel of document.querySelectorAll('header, footer')) new ResizeObserver(resize).observe(panel);
 
 // A drag that begins on the character pulls it; one that begins beside it turns the camera.
 const canvas = $('picture');
@@ -303,7 +312,7 @@ for (const type of ['pointerup', 'pointercancel']) canvas.addEventListener(type,
 // ---------------------------------------------------------------------------------- start
 
 async function start() {
-  view.resize();
+  resize();
   const get = async (file) => {
     const answer = await fetch(new URL(file, folder), { cache: 'no-cache' });
     if (!answer.ok) throw new Error(`${file}: not found (${answer.status}); build the page again`);

@@ -15,10 +15,10 @@ const DEVICE_COLOURS = [0x2b3440, 0x2f7fd6, 0xd6672f]; // headset, left, right
 
 function geometryOf({ type, size: [a, b, c] }) {
   const upright = (g) => g.rotateX(Math.PI / 2); // along y in three, along z in MuJoCo
-  if (type === SHAPES.SPHERE) return new THREE.SphereGeometry(a, 24, 16);
-  if (type === SHAPES.CAPSULE) return upright(new THREE.CapsuleGeometry(a, 2 * b, 6, 16));
-  if (type === SHAPES.ELLIPSOID) return new THREE.SphereGeometry(1, 24, 16).scale(a, b, c);
-  if (type === SHAPES.CYLINDER) return upright(new THREE.CylinderGeometry(a, a, 2 * b, 24));
+  if (type === SHAPES.SPHERE) return new THREE.SphereGeometry(a, 18, 12);
+  if (type === SHAPES.CAPSULE) return upright(new THREE.CapsuleGeometry(a, 2 * b, 4, 12));
+  if (type === SHAPES.ELLIPSOID) return new THREE.SphereGeometry(1, 18, 12).scale(a, b, c);
+  if (type === SHAPES.CYLINDER) return upright(new THREE.CylinderGeometry(a, a, 2 * b, 18));
   if (type === SHAPES.BOX) return new THREE.BoxGeometry(2 * a, 2 * b, 2 * c);
   return null;
 }
@@ -186,7 +186,7 @@ export class View {
   // The camera keeps its distance and direction while the character walks.
   follow(root, now) {
     const at = this.rootOf(root);
-    const wanted = new THREE.Vector3(at.x, this.height * 0.42, at.z);
+    const wanted = new THREE.Vector3(at.x, this.height * 0.5, at.z);
     const gap = wanted.sub(this.controls.target);
     const share = this.placed && gap.length() < 3 ? 1 - Math.exp(-(now - (this.followed ?? now)) / 250) : 1;
     this.followed = now;
@@ -202,7 +202,7 @@ export class View {
   #approach() { // a new character: as far away as its size asks for
     this.fresh = false;
     const { target } = this.controls;
-    const away = this.camera.position.clone().sub(target).setLength(2.4 + this.height);
+    const away = this.camera.position.clone().sub(target).setLength(2 + 1.2 * this.height);
     this.camera.position.copy(target).add(away);
   }
 
@@ -271,13 +271,15 @@ export class View {
     this.rope.geometry.setFromPoints([start, end]);
   }
 
-  resize() {
+  // free : { left, right, top, bottom } of the window that nothing lies over; the character stands in its middle.
+  resize({ left, right, top, bottom }) {
     if (this.renderer.xr.isPresenting) return;
     const [w, h] = [window.innerWidth, window.innerHeight];
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.renderer.setSize(w, h, false);
+    const share = Math.max(bottom - top, h / 5) / h;
     this.camera.aspect = w / h;
-    this.camera.fov = w < h ? 62 : 40; // a phone held upright sees as much of the floor
-    this.camera.updateProjectionMatrix();
+    this.camera.fov = (360 / Math.PI) * Math.atan(Math.tan(Math.PI / 9) / share); // 40 degrees of what is free
+    this.camera.setViewOffset(w, h, (w - left - right) / 2, (h - top - bottom) / 2, w, h);
   }
 }

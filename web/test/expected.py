@@ -21,8 +21,7 @@ from headset.player import Player, drive  # noqa: E402
 from headset.reader import Reader, lines_of  # noqa: E402
 from mocap.bvh import read  # noqa: E402
 from plumbing.cli import UserError  # noqa: E402
-from ppo import load_policy, sensors_of, trained_as  # noqa: E402
-from web.export import NAMES  # noqa: E402
+from web.export import NAMES, load_policy, sensors_of, trained_as  # noqa: E402
 
 STEPS, SECONDS = 240, 20.0
 

@@ -124,9 +124,12 @@ test('buttons: pause, slow motion, push, record, stand up, another character', a
   t.diagnostic(`recorded: ${csv.split('\n').length - 3} rows, which Python reads as ${played.ticks.length} ticks; `
     + `BVH of ${motion.names.length} joints, ${motion.frames} frames`);
 
-  // Where the character's chest is on the screen: drag from there.
-  await page.evaluate(() => { globalThis.app.pulled = 0; });
-  const box = { x: 350, y: 345 };
+  // Where the character is on the screen, in the middle of what the panels leave free: drag from there.
+  const box = await page.evaluate(() => {
+    const [above, below] = ['header', 'footer'].map((p) => document.querySelector(p).getBoundingClientRect());
+    const beside = above.width < 0.5 * innerWidth;
+    return { x: ((beside ? above.right : 0) + innerWidth) / 2, y: ((beside ? 0 : above.bottom) + below.top) / 2 };
+  });
   await page.mouse.move(box.x, box.y);
   await page.mouse.down();
   await page.mouse.move(box.x + 120, box.y, { steps: 6 });
