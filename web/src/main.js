@@ -17,7 +17,7 @@ const view = new View($('picture'));
 const panel = new Panel();
 view.scene.add(panel.mesh);
 const send = (type, fields = {}) => worker.postMessage({ type, ...fields });
-app.send = send;
+Object.assign(app, { send, view });
 
 let character = null; // what the worker told of it
 let [characters, demo] = [[], null];

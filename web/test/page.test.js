@@ -124,17 +124,21 @@ test('buttons: pause, slow motion, push, record, stand up, another character', a
   t.diagnostic(`recorded: ${csv.split('\n').length - 3} rows, which Python reads as ${played.ticks.length} ticks; `
     + `BVH of ${motion.names.length} joints, ${motion.frames} frames`);
 
-  // Where the character is on the screen, in the middle of what the panels leave free: drag from there.
-  const box = await page.evaluate(() => {
-    const [above, below] = ['header', 'footer'].map((p) => document.querySelector(p).getBoundingClientRect());
-    const beside = above.width < 0.5 * innerWidth;
-    return { x: ((beside ? above.right : 0) + innerWidth) / 2, y: ((beside ? 0 : above.bottom) + below.top) / 2 };
-  });
-  await page.mouse.move(box.x, box.y);
-  await page.mouse.down();
-  await page.mouse.move(box.x + 120, box.y, { steps: 6 });
-  await until(page, () => globalThis.app.state.pull, 5000);
-  await page.mouse.up();
+  // Drag the character's root, wherever it is on the screen; it walks, so a first try may miss.
+  let pulled = false;
+  for (let i = 0; i < 5 && !pulled; i++) {
+    const [x, y] = await page.evaluate(() => {
+      const { x: across, y: up } = globalThis.app.view.rootOf(1).project(globalThis.app.view.camera);
+      return [((across + 1) * innerWidth) / 2, ((1 - up) * innerHeight) / 2];
+    });
+    await page.mouse.move(x, y);
+    await page.mouse.down();
+    await page.mouse.move(x + 120, y, { steps: 6 });
+    await sleep(500);
+    pulled = await page.evaluate(() => Boolean(globalThis.app.state.pull));
+    await page.mouse.up();
+  }
+  assert.ok(pulled, 'a drag pulls the character');
   await until(page, () => !globalThis.app.state.pull, 5000);
 
   await click('reset');
