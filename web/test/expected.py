@@ -2,7 +2,7 @@
 
 python web/test/expected.py loop CSV       each character: physics under given controls, first tick, 20 s of closed loop
 python web/test/expected.py stream CSV ... each file: the ticks, or the complaint
-python web/test/expected.py bvh FILE       names, frames, and where the root is
+python web/test/expected.py bvh FILE       names and frames; with NAME QPOS how far it is from Python's
 """
 
 import json
@@ -21,6 +21,7 @@ from headset.player import Player, drive  # noqa: E402
 from headset.reader import Reader, lines_of  # noqa: E402
 from mocap.bvh import read  # noqa: E402
 from plumbing.cli import UserError  # noqa: E402
+from retarget import write_bvh  # noqa: E402
 from web.export import NAMES, load_policy, sensors_of, trained_as  # noqa: E402
 
 STEPS, SECONDS = 240, 20.0
@@ -83,13 +84,23 @@ def stream(paths):
     return out
 
 
-def bvh(path):
-    """What a BVH file of ours holds, to our own reader."""
+def bvh(path, name=None, qpos=None):
+    """What a BVH file of the page holds, and how far it is from `write_bvh`'s of the same states (JSON)."""
     motion = read(path)
-    return {"names": motion.names, "frames": len(motion.values), "first": motion.values[0, :3].tolist()}
+    out = {"names": motion.names, "frames": len(motion.values)}
+    if name:
+        own = Path(path).with_suffix(".own.bvh")
+        write_bvh(own, character.load(name), np.array(json.loads(Path(qpos).read_text())), 30.0)
+        ours = read(own)
+        turns = (motion.values - ours.values)[:, 3:] / 360.0  # whole turns are none
+        apart = np.abs(turns - np.round(turns)).max() * 360.0
+        out["place"], out["angle"] = float(np.abs(motion.values - ours.values)[:, :3].max()), float(apart)
+        out["offsets"] = float(np.abs(motion.offsets - ours.offsets).max())
+        out["same"] = motion.names == ours.names and motion.parents.tolist() == ours.parents.tolist()
+    return out
 
 
 if __name__ == "__main__":
     command, *paths = sys.argv[1:]
-    results = {"loop": lambda: loop(paths[0]), "stream": lambda: stream(paths), "bvh": lambda: bvh(paths[0])}
+    results = {"loop": lambda: loop(paths[0]), "stream": lambda: stream(paths), "bvh": lambda: bvh(*paths)}
     json.dump(results[command](), sys.stdout)

@@ -5,6 +5,7 @@ import { Reader, linesOf } from '../src/reader.js';
 import { Simulation, fetchCharacter } from '../src/character.js';
 import { Stream } from '../src/calibration.js';
 import { loadMujoco } from '../src/mujoco.js';
+import { writeBvh } from '../src/bvh.js';
 
 const folder = new URL('data/', import.meta.url);
 const furthest = (a, b) => a.reduce((worst, x, i) => Math.max(worst, Math.abs(x - b[i])), 0);
@@ -25,6 +26,7 @@ export async function parity(name, expected, text, seconds) {
   const roots = [];
   const costs = [];
   const when = [];
+  const [frames, states] = [[], []];
   loop: for (const sample of new Reader('demo', player.devices).read(linesOf(text))) {
     for (const tick of stream.push(sample)) {
       const before = performance.now();
@@ -34,6 +36,10 @@ export async function parity(name, expected, text, seconds) {
         Object.assign(out, { obs: furthest(expected.obs, player.obs), action: furthest(expected.action, player.action) });
       }
       if (end) when.push([roots.length, end]);
+      if (frames.length < 90) {
+        frames.push({ xpos: sim.xpos.slice(), xquat: sim.xquat.slice() });
+        states.push(Array.from(sim.qpos));
+      }
       roots.push(Array.from(sim.qpos.subarray(0, 3)));
       if (roots.length >= 30 * seconds) break loop;
     }
@@ -43,7 +49,8 @@ export async function parity(name, expected, text, seconds) {
   out.apart = roots.map((r, i) => Math.hypot(...r.map((x, k) => x - expected.roots[i][k])));
   out.finite = roots.flat().every(Number.isFinite);
   out.ends = { ...player.ends };
-  Object.assign(out, { costs, when });
+  Object.assign(out, { costs, when, states });
+  out.bvh = writeBvh(sim.table, sim.body_parentid, sim.body_ipos, frames, 30);
   sim.delete();
   return out;
 }

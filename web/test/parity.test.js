@@ -1,7 +1,8 @@
 // The browser against Python: physics, observation, action, closed loop.
 
 import assert from 'node:assert/strict';
-import { readFileSync } from 'node:fs';
+import { mkdtempSync, readFileSync, rmSync, writeFileSync } from 'node:fs';
+import { tmpdir } from 'node:os';
 import { join } from 'node:path';
 import { after, before, test } from 'node:test';
 import { CHARACTERS, browser, expected, open, percentile, serve, until, web } from './tools.js';
@@ -16,7 +17,8 @@ before(async () => {
   await page.goto(`${server.url}parity.html`);
   await until(page, () => globalThis.parity);
 });
-after(async () => { await chrome?.close(); server?.close(); });
+const folder = mkdtempSync(join(tmpdir(), 'bvh-'));
+after(async () => { await chrome?.close(); server?.close(); rmSync(folder, { recursive: true }); });
 
 for (const name of CHARACTERS) {
   test(`${name}: as in Python`, async (t) => {
@@ -41,6 +43,13 @@ for (const name of CHARACTERS) {
     assert.deepEqual(together(got.when), together(wanted[name].when));
     assert.ok(got.finite);
     assert.ok(Number(p99) < 33, `control step p99 ${p99} ms`); // the budget; the aim of 10 ms is printed
+    const [bvh, states] = ['bvh', 'json'].map((kind) => join(folder, `${name}.${kind}`));
+    writeFileSync(bvh, got.bvh);
+    writeFileSync(states, JSON.stringify(got.states));
+    const motion = expected('bvh', bvh, name, states);
+    t.diagnostic(`${name}: BVH against retarget.write_bvh: root ${motion.place.toExponential(1)} cm, `
+      + `angles ${motion.angle.toExponential(1)} degrees, offsets ${motion.offsets.toExponential(1)} cm`);
+    assert.ok(motion.same && motion.place < 1e-6 && motion.angle < 1e-4 && motion.offsets < 1e-6);
     assert.deepEqual(faults, []);
   });
 }
