@@ -1,4 +1,4 @@
-// npm run build: the data by `python -m web export`, the scripts by esbuild, all into dist/, a folder for any static host.
+// npm run build: the data by `python -m web export`, the scripts by esbuild, into dist/, which any static host takes.
 
 import { build } from 'esbuild';
 import { execFileSync } from 'node:child_process';
@@ -12,7 +12,7 @@ const from = (...parts) => join(here, ...parts);
 const python = process.env.PYTHON || 'python3';
 
 // MuJoCo's glue makes two kinds of functions out of strings, which a strict Content-Security-Policy forbids.  Closures
-// do the same.  If another version of the package reads otherwise, the build fails here and not in the visitor's browser.
+// do the same.  If another version of the package reads otherwise, the build fails here, not in the visitor's browser.
 const CLOSURES = [[
   `      let [args, invokerFnBody] = createJsInvoker(argTypes, isClassMethodFunc, returns, isAsync);
       var invokerFn = new Function(...args, invokerFnBody)(...closureArgs);`,

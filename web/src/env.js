@@ -24,7 +24,8 @@ export class HeadingFrame { // env.HeadingFrame: on the floor below the root, tu
   }
 }
 
-export function observeUser(frame, devices, out, at) { // env.observe_user [Eq. 4]: devices { pos: [[3]…], rot: [[9]…] }
+// env.observe_user [Eq. 4].  devices : { pos: [[3] …], rot: [[9] …] }
+export function observeUser(frame, devices, out, at) {
   const d = devices.pos.length;
   devices.pos.forEach((p, i) => frame.place(...p, out, at + 3 * i));
   devices.rot.forEach((r, i) => frame.columns(r, 0, out, at + 3 * d + 6 * i));

@@ -86,7 +86,6 @@ const heard = {
     app.falls = m.ends.fall;
     app.finite = (app.finite ?? true) && m.xpos.every(Number.isFinite) && m.xquat.every(Number.isFinite);
     app.costs = [...(app.costs || []), m.cost].slice(-3000);
-    if (app.trace) app.trace.push({ ticks: m.ticks, root: [...m.xpos.slice(3 * character.root, 3 * character.root + 3)] });
     if (m.sent) delays.push(clock() - m.sent);
     if (delays.length > 60) delays.shift();
     if (!m.sensors || view.states.length === 0) view.height = heightOf(m);
@@ -281,7 +280,8 @@ function resize() { // the panels lie over the picture
   const [above, below] = [document.querySelector('header'), document.querySelector('footer')]
     .map((panel) => panel.getBoundingClientRect());
   const beside = above.width < 0.5 * window.innerWidth;
-  view.resize({ left: beside ? above.right : 0, right: window.innerWidth, top: beside ? 0 : above.bottom, bottom: below.top });
+  const [left, top] = beside ? [above.right, 0] : [0, above.bottom];
+  view.resize({ left, right: window.innerWidth, top, bottom: below.top });
 }
 addEventListener('resize', resize);
 for (const panel of document.querySelectorAll('header, footer')) new ResizeObserver(resize).observe(panel);
@@ -294,7 +294,7 @@ canvas.addEventListener('pointerdown', (event) => {
   view.controls.enabled = false;
   event.stopImmediatePropagation();
   canvas.setPointerCapture(event.pointerId);
-  pull = { body: hit.body, at: hit.at, target: view.inPlane(event.clientX, event.clientY, hit.point), point: hit.point };
+  pull = { ...hit, target: view.inPlane(event.clientX, event.clientY, hit.point) };
 }, { capture: true });
 canvas.addEventListener('pointermove', (event) => {
   if (!pull) return;

@@ -44,7 +44,8 @@ function bodyGeometries(shapes) {
 
 function frameOf(colour, size) { // a device: a small block and its three axes
   const group = new THREE.Group();
-  const block = new THREE.Mesh(new THREE.BoxGeometry(size, size, size), new THREE.MeshLambertMaterial({ color: colour }));
+  const box = new THREE.BoxGeometry(size, size, size);
+  const block = new THREE.Mesh(box, new THREE.MeshLambertMaterial({ color: colour }));
   group.add(block, new THREE.AxesHelper(0.18));
   return group;
 }
@@ -228,7 +229,8 @@ export class View {
     const { origin: [x, y, z], yaw } = calibration;
     const base = TO_THREE.clone().multiply(new THREE.Matrix4().makeTranslation(x, y, z))
       .multiply(new THREE.Matrix4().makeRotationZ(yaw));
-    const mirror = new THREE.Matrix4().makeTranslation(2 * apart, 0, 0).multiply(new THREE.Matrix4().makeScale(-1, 1, 1));
+    const flip = new THREE.Matrix4().makeScale(-1, 1, 1);
+    const mirror = new THREE.Matrix4().makeTranslation(2 * apart, 0, 0).multiply(flip);
     this.actor.group.matrix.copy(base).multiply(mirror);
     this.devices.matrix.copy(this.actor.group.matrix);
     this.second.group.matrix.copy(base).multiply(new THREE.Matrix4().makeTranslation(0, 1.3, 0));

@@ -41,12 +41,13 @@ test('an emulated Quest 3: enter, wave, walk, lose a controller, lose tracking, 
   assert.equal(await page.$eval('#enter', (b) => b.textContent), 'Enter VR');
   const demo = readFileSync(join(web, 'dist/data/demo.csv'), 'utf8');
   await page.evaluate(wear, demo);
-  // Software pictures take a fifth of a second each, which the guard takes for drop-outs: none are drawn while it counts.
+  // Software pictures take a fifth of a second each, which the guard takes for drop-outs: none while it counts.
   await page.evaluate(() => { globalThis.app.still = true; });
   await page.click('#enter'); // a real click: a session needs one
   await until(page, () => globalThis.app.calibration, 20_000);
   const { height, scale, floor } = await page.evaluate(() => globalThis.app.calibration);
-  t.diagnostic(`calibrated: headset ${height.toFixed(2)} m up, floor at ${floor.toFixed(2)} m, heights times ${scale[2].toFixed(3)}`);
+  t.diagnostic(`calibrated: headset ${height.toFixed(2)} m up, floor at ${floor.toFixed(2)} m, `
+    + `heights times ${scale[2].toFixed(3)}`);
   assert.ok(Math.abs(height - 1.67) < 0.03);
   if (process.env.SHOTS) {
     await page.evaluate(() => { globalThis.app.still = false; });
@@ -70,7 +71,8 @@ test('an emulated Quest 3: enter, wave, walk, lose a controller, lose tracking, 
   const state = () => page.evaluate(() => ({ lost: globalThis.app.state.lost, ends: globalThis.app.state.ends,
     ticks: globalThis.app.ticks, finite: globalThis.app.finite, z: globalThis.app.state.xpos[5] }));
   const gaps = await watch(8); // stands, waves, walks
-  t.diagnostic(`root to headset, horizontally: median ${gaps[gaps.length >> 1].toFixed(2)} m, largest ${gaps.at(-1).toFixed(2)} m`);
+  t.diagnostic(`root to headset, horizontally: median ${gaps[gaps.length >> 1].toFixed(2)} m, `
+    + `largest ${gaps.at(-1).toFixed(2)} m`);
   assert.ok(gaps[gaps.length >> 1] < 0.5);
   assert.ok(gaps.at(-1) < 1.3); // farther than 1 m it is stood up again
 

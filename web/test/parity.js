@@ -33,7 +33,8 @@ export async function parity(name, expected, text, seconds) {
       const end = player.step(tick);
       costs.push(performance.now() - before);
       if (!roots.length) {
-        Object.assign(out, { obs: furthest(expected.obs, player.obs), action: furthest(expected.action, player.action) });
+        out.obs = furthest(expected.obs, player.obs);
+        out.action = furthest(expected.action, player.action);
       }
       if (end) when.push([roots.length, end]);
       if (frames.length < 90) {

@@ -28,8 +28,8 @@ for (const name of CHARACTERS) {
     const falls = ({ fall, away, bad }) => `${fall} falls, ${away} times lost the user, ${bad} diverged`;
     const [p50, p99] = [0.5, 0.99].map((share) => percentile(got.costs, share).toFixed(1));
     const agrees = got.apart.findIndex((x) => x > 0.01);
-    t.diagnostic(`${name}: 240 steps: qpos ${got.qpos.toExponential(1)}, qvel ${got.qvel.toExponential(1)}; first tick: `
-      + `observation ${got.obs.toExponential(1)}, action ${got.action.toExponential(1)}; root after 2 s `
+    t.diagnostic(`${name}: 240 steps: qpos ${got.qpos.toExponential(1)}, qvel ${got.qvel.toExponential(1)}; `
+      + `first tick: observation ${got.obs.toExponential(1)}, action ${got.action.toExponential(1)}; root after 2 s `
       + `${two.toExponential(1)} m, within 1 cm for ${agrees < 0 ? '20.0' : (agrees / 30).toFixed(1)} s`);
     t.diagnostic(`${name}: 20 s: ${falls(got.ends)}; Python: ${falls(wanted[name].ends)}`);
     t.diagnostic(`${name}: control step p50 ${p50} ms, p99 ${p99} ms`);
