@@ -1,0 +1,376 @@
+// A headset's rows: columns, axes, and what can go wrong.  Twin of headset/reader.py, name by name.
+
+import { distance, heading, quatAbout, quatConj, quatMul, quatRotate, quatSlerp, subtract, add } from './human.js';
+
+export class UserError extends Error {} // plumbing.cli.UserError: one line for the person at the page
+
+export const DEVICES = ['head', 'left', 'right'];
+const PARTS = ['px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw'];
+export const COLUMNS = ['time', ...DEVICES.flatMap((d) => PARTS.map((p) => `${d}_${p}`))];
+export const SAMPLE_RATE = 90; // Hz, of a stream without times
+const LINE_LIMIT = 65536;
+const EMPTY = ['', 'nan', 'null', 'none'];
+const [STEPS, JUDGED] = [[0.0005, 0.1], 11]; // s between two rows; steps by whose median a time column is judged
+const SEPARATORS = { ';': 'semicolons', '\t': 'tabs', '|': 'bars', ' ': 'spaces' };
+
+// ---------------------------------------------------------------------------------- reading
+
+export function column(name) { // reader.column: the canonical name of a column, or null
+  name = name.trim().replace(/^"+|"+$/g, '').toLowerCase();
+  if (['time', 't', 'timestamp'].includes(name)) return 'time';
+  const device = '(head|hmd|headset|(?:left|right)(?:_hand|_controller)?)';
+  const found = name.match(new RegExp(`^${device}_(?:(?:p|pos_|position_|)([xyz])|(?:q|rot_|rotation_)([xyzw]))$`));
+  if (!found) return null;
+  const which = ['head', 'hmd', 'headset'].includes(found[1]) ? 'head' : found[1].split('_')[0];
+  return found[2] ? `${which}_p${found[2]}` : `${which}_q${found[3]}`;
+}
+
+export function parseNumber(word) { // plumbing.files.parse_number: what Python's float() reads; NaN-or-throw
+  const text = word.trim();
+  if (/^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(text)) return Number(text);
+  const special = text.match(/^([+-]?)(inf|infinity|nan)$/i);
+  if (!special) throw new Error('no number');
+  return special[2].toLowerCase() === 'nan' ? NaN : special[1] === '-' ? -Infinity : Infinity;
+}
+
+export const validColumns = () => // reader.valid_columns
+  'time (optional) and DEVICE_px, _py, _pz, _qx, _qy, _qz, _qw for DEVICE head, left, right';
+
+export function* linesOf(text) { // reader.lines_of: lines with their ends
+  for (let start = 0; start < text.length;) {
+    const end = text.indexOf('\n', start);
+    const stop = end < 0 ? text.length : end + 1;
+    yield text.slice(start, stop);
+    start = stop;
+  }
+}
+
+export class Reader { // reader.Reader, of files: a line that cannot be read is an error, a last one cut short is not
+  constructor(name, devices = 3) {
+    Object.assign(this, { name, steps: [], before: null, line: 0, unreadable: 0, at: null, names: null });
+    this.wanted = COLUMNS.slice(0, 1 + devices * PARTS.length);
+    this.axes = null; // ours: what a comment before the columns says, as the page's own recordings do
+  }
+
+  fail(text) {
+    throw new UserError(`${this.name}${text}`);
+  }
+
+  * read(lines) {
+    for (const text of lines) {
+      this.line += 1;
+      if (this.at === null && text.trim().includes('\r') && !text.includes('\0')) {
+        this.fail(`, line ${this.line}: line ends of CR alone; valid: LF, or CR and LF`);
+      }
+      if (text.length >= LINE_LIMIT) {
+        this.fail(`, line ${this.line}: longer than ${LINE_LIMIT} bytes; valid: a CSV's lines`);
+      }
+      const cells = text.replace(/^\ufeff+/, '').trim();
+      if (!cells || cells.startsWith('#')) {
+        this.axes ??= cells.match(/^#.*\baxes:? (\w+)/)?.[1] ?? null;
+        continue;
+      }
+      if (this.at === null) {
+        if (text.includes('\0')) this.fail(`, line ${this.line}: UTF-16 or no text; valid: a CSV's lines in UTF-8`);
+        this.header(cells);
+        continue;
+      }
+      let values;
+      try {
+        values = this.values(cells);
+      } catch (error) {
+        if (!(error instanceof UserError)) throw error;
+        this.unreadable += 1;
+        if (text.endsWith('\n')) this.fail(`, line ${this.line}, ${error.message}`);
+        continue;
+      }
+      const device = (d) => values.slice(1 + 7 * d, 8 + 7 * d);
+      if (this.steps.length < JUDGED && !fault(device(0))) this.judge(values[0]);
+      const rows = [0, 1, 2].map(device);
+      yield { t: values[0], pos: rows.map((r) => r.slice(0, 3)), quat: rows.map((r) => r.slice(3)) };
+    }
+    if (this.at === null) this.fail(`: is empty; expected a line of column names: ${validColumns()}`);
+  }
+
+  judge(t) { // reader.Reader.judge: can the first times be a headset's seconds?
+    if (Number.isFinite(t)) {
+      if (this.before !== null) this.steps.push(t - this.before);
+      this.before = t;
+    }
+    if (this.steps.length < JUDGED) return;
+    const sum = this.steps.reduce((a, b) => a + b, 0);
+    const step = [...this.steps].sort((a, b) => a - b)[JUDGED >> 1] || sum / JUDGED;
+    if (STEPS[0] <= step && step < 0.999 * STEPS[1]) return;
+    const named = { milliseconds: 1e-3, microseconds: 1e-6, nanoseconds: 1e-9, minutes: 60, hours: 3600 };
+    const rate = (u) => 1 / Math.max(Math.abs(step) * u, 1e-300);
+    const unit = Object.keys(named).find((k) => rate(named[k]) >= 20 && rate(named[k]) <= 1000);
+    const short = (x) => String(Number(x.toPrecision(3)));
+    let valid = `seconds that increase, ${1 / STEPS[1]} to ${1 / STEPS[0]} rows in each`;
+    let what = `time steps of ${short(step)} s${unit ? `: ${unit}?` : ''}`;
+    if (step <= 0) {
+      what = step ? `time runs backwards, by ${short(-step)} s a row` : 'time stands still';
+      valid += ', or no column time (then the sample rate says how many)';
+    }
+    this.fail(`, line ${this.line}, column ${this.names[this.at[0]]}: ${what}; valid: ${valid}`);
+  }
+
+  header(line) { // reader.Reader.header: where which column is
+    this.names = line.split(',').map((c) => c.trim());
+    const known = this.names.map(column);
+    const ours = (mark) => line.split(mark).filter((c) => column(c)).length;
+    const mark = Object.keys(SEPARATORS).reduce((a, b) => (ours(b) > ours(a) ? b : a));
+    if (ours(mark) > Math.max(ours(','), 1)) {
+      const valid = 'commas, and points in the numbers';
+      this.fail(`, line ${this.line}: ${SEPARATORS[mark]} between the columns; valid: ${valid}`);
+    }
+    const missing = this.wanted.slice(1).filter((c) => !known.includes(c));
+    const twice = known.find((c, i) => c && known.indexOf(c) !== i);
+    if (twice) this.fail(`, line ${this.line}: column ${twice} is there twice; valid: once each`);
+    if (missing.length) {
+      const more = missing.length > 4 ? ` and ${missing.length - 4} more` : '';
+      const alone = missing.some((c) => c.startsWith('head')) ? '' : '; "headset alone" needs the headset\'s only';
+      const has = this.names.join(', ').slice(0, 200);
+      this.fail(`, line ${this.line}: no column ${missing.slice(0, 4).join(', ')}${more}; it has ${has}; `
+        + `valid: ${validColumns()}${alone}`);
+    }
+    this.at = this.wanted.map((c) => known.indexOf(c));
+  }
+
+  values(line) { // reader.Reader.values: the numbers of a row in the order of COLUMNS
+    const cells = line.split(',');
+    if (cells.length !== this.names.length) {
+      const name = this.names[Math.min(cells.length, this.names.length) - 1];
+      const comma = cells.length > this.names.length ? ' (commas in the numbers? valid: points)' : '';
+      const valid = `${this.names.length}, as in the first line${comma}`;
+      throw new UserError(`column ${name}: ${cells.length} cells; valid: ${valid}`);
+    }
+    const out = Array(COLUMNS.length).fill(NaN);
+    this.at.forEach((i, k) => {
+      const cell = i >= 0 ? cells[i].trim().replace(/^"+|"+$/g, '') : '';
+      if (EMPTY.includes(cell.toLowerCase())) return;
+      try {
+        out[k] = parseNumber(cell);
+      } catch {
+        throw new UserError(`column ${this.names[i]}: '${cell.slice(0, 40)}'; valid: a number, or nothing`);
+      }
+    });
+    return out;
+  }
+}
+
+// ---------------------------------------------------------------------------------- axes
+
+export const AXES = { // reader.AXES: rows are our x, y, z in the source's coordinates
+  unity: [[0, 0, 1], [-1, 0, 0], [0, 1, 0]],
+  openxr: [[0, 0, -1], [-1, 0, 0], [0, 1, 0]], // WebXR's, too
+  mujoco: [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+};
+const MIRRORED = { unity: -1, openxr: 1, mujoco: 1 }; // the matrices' determinants
+export const GRIP = { unity: 15, openxr: 90, mujoco: 90 }; // reader.GRIP [degrees]
+
+export function toWorld(pos, quat, axes, grip = null) { // reader.to_world
+  const m = AXES[axes];
+  const apply = (v) => m.map((row) => row[0] * v[0] + row[1] * v[1] + row[2] * v[2]);
+  const degrees = -90 + (grip ?? GRIP[axes]);
+  const turn = quatAbout(1, (degrees * Math.PI) / 180);
+  return {
+    pos: pos.map(apply),
+    quat: quat.map((q, i) => {
+      const own = [q[3], ...apply(q).map((x) => MIRRORED[axes] * x)];
+      return i && degrees ? quatMul(own, turn) : own;
+    }),
+  };
+}
+
+// ---------------------------------------------------------------------------------- what can go wrong
+
+export const GAP = 0.1; // s without a row: a drop-out
+const FROZEN = 0.25; // s without any change while another device moves: lost
+const FAR_AWAY = 100; // m from the source's origin: not a place
+const REACH = 1.5; // m from headset to controller: longer than an arm
+const TELEPORT = 1.0; // m between two headset poses: the stream is re-anchored
+const STEP = 0.2; // m between two samples of a headset: too fast for a head
+const JUMP = 0.5; // m between two samples of a controller: too fast for a hand
+const SETTLE = 0.1; // s that a controller which jumped must stay where it is
+const [HOLD, RELAX] = [1.0, 0.5]; // s that a lost controller is held; time constant with which it then sinks
+const [BLEND, CATCH_UP] = [0.3, 2.0]; // s, m/s: the way back from the held to the true pose
+const [CLOCK_AHEAD, CLOCK_BACK] = [5, 1]; // s: farther jumps of the time column are another clock
+const NEUTRAL = [[0, 0, 0], [-0.04, 0.26, -0.9], [-0.04, -0.26, -0.9]]; // m, the hanging hand.  ASSUMED
+const IDENTITY = [1, 0, 0, 0];
+
+export class Clock { // reader.Clock: the time column -> seconds since the first row, never backwards
+  constructor(rate = SAMPLE_RATE) {
+    Object.assign(this, { rate, last: null, base: 0, dropped: 0, jumps: 0, same: 0, forget: false });
+  }
+
+  stamp(t) { // seconds since the first row, or null for a row to drop
+    const finite = Number.isFinite(t);
+    if (this.last === null) {
+      this.base = finite ? -t : 0;
+      this.last = 0;
+      return 0;
+    }
+    let step = finite ? t + this.base - this.last : 1 / this.rate;
+    if (Math.abs(step) < 1e-9) step = 0;
+    this.same = step === 0 ? this.same + 1 : 0;
+    if (this.forget || this.same >= 10 || !(-CLOCK_BACK <= step && step <= CLOCK_AHEAD)) {
+      if (!this.forget) this.jumps += 1;
+      step = 1 / this.rate;
+      if (finite) this.base = this.last + step - t;
+    }
+    this.forget = false;
+    if (step < 0) {
+      this.dropped += 1;
+      return null;
+    }
+    this.last += step;
+    return this.last;
+  }
+
+  idle(seconds) { // time goes on without rows
+    [this.last, this.forget] = [(this.last || 0) + seconds, true];
+    return this.last;
+  }
+}
+
+export function fault(row) { // reader.fault: why a device's row cannot be a pose, or null
+  if (!row.every(Number.isFinite)) return 'not finite';
+  if (row.every((x) => x === 0)) return 'all zero';
+  if (Math.max(...row.slice(0, 3).map(Math.abs)) > FAR_AWAY) return 'far away';
+  const norm = Math.hypot(...row.slice(3).map((x) => Math.min(Math.max(x, -1e3), 1e3)));
+  return Math.abs(norm - 1) > 0.1 ? 'no rotation' : null;
+}
+
+const newTrack = () => ({ // reader.Track
+  raw: null, changed: -Infinity, good: null, yaw: 0, lost: 'not seen', since: 0, jumped: null, settling: 0, last: null,
+  held: null, mix: 1, pace: 0,
+});
+
+export class Guard { // reader.Guard: three devices that may be lost at any time -> three finite poses
+  constructor(rate, devices = 3) {
+    Object.assign(this, { rate, devices, t: null, yaw: 0, shift: [0, 0, 0] });
+    this.tracks = DEVICES.map(newTrack);
+    [this.events, this.heads] = [new Map(), new Map()]; // "device what" -> times; what the headset's rows were
+  }
+
+  push(sample, why = null) { // the poses to use, in order; several after a drop-out, none before the headset is seen
+    const out = [];
+    if (this.t !== null && sample.t - this.t > GAP) {
+      const nothing = [0, 1, 2].map(() => Array(7).fill(NaN));
+      while (this.t + 1 / this.rate < sample.t) out.push(this.one(this.t + 1 / this.rate, nothing, 'drop-out'));
+    }
+    out.push(this.one(sample.t, sample.pos.map((p, i) => [...p, ...sample.quat[i]]), why));
+    return out.filter((s) => s);
+  }
+
+  live(device = 0) { // is the last pose the device's own, not a held or blended one?
+    return this.tracks[device].lost === null && this.tracks[device].mix >= 1;
+  }
+
+  report() { // reader.Guard.report, without the seconds
+    return [...this.events].filter(([key]) => DEVICES.indexOf(key.split(' ')[0]) < this.devices).sort()
+      .map(([key, n]) => `${key}: ${n} time${n > 1 ? 's' : ''}`);
+  }
+
+  one(t, rows, why) {
+    const dt = this.t === null ? 0 : t - this.t;
+    this.t = t;
+    const faults = rows.map((row) => why || fault(row));
+    this.tracks.forEach((track, i) => {
+      if (!faults[i] && (track.raw === null || track.raw.some((x, k) => x !== rows[i][k]))) {
+        [track.raw, track.changed] = [rows[i], t];
+      }
+    });
+    const newest = Math.max(...this.tracks.map((track) => track.changed));
+    this.tracks.forEach((track, i) => {
+      if (!faults[i] && t - track.changed > FROZEN && newest > track.changed) faults[i] = 'frozen';
+    });
+    if (why === null) this.heads.set(faults[0], (this.heads.get(faults[0]) || 0) + 1);
+    rows = rows.map((row, i) => (faults[i] ? [0, 0, 0, 1, 0, 0, 0] : row));
+    const unit = rows.map((row) => {
+      const norm = Math.hypot(...row.slice(3));
+      return row.slice(3).map((x) => x / norm);
+    });
+    if (!faults[0]) this.anchor(rows[0].slice(0, 3), unit[0]);
+    const turn = quatAbout(2, this.yaw);
+    const pos = rows.map((row) => add(quatRotate(turn, row.slice(0, 3)), this.shift));
+    const quat = unit.map((q) => quatMul(turn, q));
+    const head = this.device(0, t, dt, faults[0], [pos[0], quat[0]], [[0, 0, 0], IDENTITY]);
+    if (head === null) return null;
+    const frame = [head[0], quatAbout(2, heading(head[1]))];
+    const out = [head];
+    for (const i of [1, 2]) {
+      const bad = faults[i] || this.astray(i, t, pos[i], head[0]);
+      out.push(this.device(i, t, dt, bad, [pos[i], quat[i]], frame));
+    }
+    return { t, pos: out.map((p) => p[0]), quat: out.map((p) => p[1]) };
+  }
+
+  anchor(pos, quat) { // re-anchor the stream if its headset, given as it came, is suddenly elsewhere
+    const head = this.tracks[0];
+    const place = () => add(quatRotate(quatAbout(2, this.yaw), pos), this.shift);
+    if (head.good !== null && distance(place(), head.good) > TELEPORT) {
+      this.count('head', 'teleport');
+      this.yaw = head.yaw - heading(quat);
+      const gap = subtract(head.good, place());
+      this.shift = add(this.shift, [gap[0], gap[1], Math.abs(gap[2]) > 0.5 ? gap[2] : 0]);
+    }
+    head.yaw = heading(quat) + this.yaw;
+  }
+
+  astray(i, t, pos, head) { // why a controller's usable row is not to be believed, or null
+    const track = this.tracks[i];
+    if (distance(pos, head) > REACH) return 'out of reach';
+    if ([null, 'jump'].includes(track.lost) && track.good !== null && distance(pos, track.good) > JUMP) {
+      if (track.jumped === null || distance(pos, track.jumped) > JUMP) track.settling = t;
+      track.jumped = pos;
+      if (t - track.settling < SETTLE) return 'jump';
+    }
+    track.jumped = null;
+    return null;
+  }
+
+  device(i, t, dt, bad, truth, frame) { // hold, blend or believe one device; null: a headset never seen
+    const track = this.tracks[i];
+    if (bad) {
+      if (track.last === null && i === 0) return null;
+      track.last ??= [NEUTRAL[i], IDENTITY];
+      if (track.lost === null || track.held === null) [track.held, track.since] = [track.last, t];
+      if (track.lost !== bad) this.count(DEVICES[i], bad);
+      [track.lost, track.mix] = [bad, 0];
+      if (i && t - track.since > HOLD) {
+        track.held = blend(track.held, [NEUTRAL[i], IDENTITY], 1 - Math.exp(-dt / RELAX));
+      }
+      track.last = track.held;
+    } else {
+      const own = toFrame(frame, truth);
+      const step = i === 0 && track.lost === null && distance(truth[0], track.good) > STEP;
+      if (track.last !== null && (track.lost || step)) {
+        if (step) this.count('head', 'step');
+        [track.held, track.mix] = [track.last, 0];
+        track.pace = 1 / Math.max(BLEND, distance(own[0], track.held[0]) / CATCH_UP);
+      }
+      [track.lost, track.good] = [null, truth[0]];
+      track.mix = Math.min(1, track.mix + dt * track.pace);
+      track.last = track.mix >= 1 ? own : blend(track.held, own, track.mix);
+    }
+    return fromFrame(frame, track.last);
+  }
+
+  count(device, what) {
+    this.events.set(`${device} ${what}`, (this.events.get(`${device} ${what}`) || 0) + 1);
+  }
+}
+
+export function blend(a, b, share) { // reader.blend: between two poses [pos, quat]
+  return [a[0].map((x, k) => x + share * (b[0][k] - x)), quatSlerp(a[1], b[1], share)];
+}
+
+export function toFrame(frame, pose) { // reader.to_frame
+  const back = quatConj(frame[1]);
+  return [quatRotate(back, subtract(pose[0], frame[0])), quatMul(back, pose[1])];
+}
+
+export function fromFrame(frame, pose) { // reader.from_frame
+  return [add(frame[0], quatRotate(frame[1], pose[0])), quatMul(frame[1], pose[1])];
+}
