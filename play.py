@@ -33,9 +33,9 @@ import mocap.data
 import retarget
 from character import Character
 from env import EPISODE_STEPS, Env
-from headset import calibration
+from headset import axes, calibration
 from headset.player import Pace, Player, drive, ride
-from headset.reader import AXES, GAP, SAMPLE_RATE, Reader, arriving, is_live, lines_of
+from headset.reader import AXES, DEVICES, GAP, SAMPLE_RATE, Reader, arriving, is_live, lines_of
 from human import heading
 from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_action, simulate
 from mocap.augment import resize
@@ -49,7 +49,7 @@ from retarget import Reference, forward_kinematics
 # flags that say something of a motion alone, or of a stream alone
 OF_MOTION = {"motion", "clips", "joint_map", "unit", "up", "all", "split", "half", "rows", "user_scale"}
 OF_MOTION |= {"random_starts", "sequence"}
-OF_STREAM = {"axes", "grip", "sample_rate", "user_height", "realtime"}
+OF_STREAM = {"axes", "grip", "stream_unit", "devices", "sample_rate", "user_height", "realtime"}
 
 
 @dataclass
@@ -72,9 +72,17 @@ class Options(metrics.Options):
     stream: str | None = arg(
         None, "drive the character with a headset's .csv file, a named pipe, or - for standard input"
     )
-    axes: str = arg("unity", "axes of the stream", choices=tuple(AXES))
+    axes: str = arg(
+        "auto", "axes of the stream; auto: what fits a person best (a live stream: unity)", choices=("auto", *AXES)
+    )
     grip: float | None = arg(
         None, "how far the fingers point below the controllers' forward axis [degrees]: unity 15, else 90 by default"
+    )
+    stream_unit: float | None = arg(None, "metres a unit of the stream; its axes' own by default", check=POSITIVE)
+    devices: tuple[str, ...] = arg(
+        DEVICES,
+        "which of the stream's devices are head, left and right, as left,head,right",
+        check=(lambda v: sorted(v) == sorted(DEVICES), "head, left and right, each once"),
     )
     sample_rate: float = arg(SAMPLE_RATE, "rows a second of a stream without times", check=POSITIVE)
     user_height: float | None = arg(
@@ -256,6 +264,16 @@ def _open_viewer(model, data, root, how, port):
 PICTURED = 600.0  # s of a stream that pictures are kept of, at most
 
 
+def watched(samples, watch: axes.Watch):
+    """The samples of a live stream; what does not fit a person is said as it comes.
+
+    Test      tests/headset/test_stream.py::test_axes_are_found"""
+    for sample in samples:
+        for line in watch.push(sample):
+            print(line, flush=True)
+        yield sample
+
+
 def play_stream(char: Character, policy, path, devices: int, opt: Options) -> None:
     """Drive the character with a recorded or live headset; print what happened.
 
@@ -268,11 +286,12 @@ def play_stream(char: Character, policy, path, devices: int, opt: Options) -> No
     read = 1 if opt.sensors == "hmd" else devices
     player = Player(char, policy.mean_action, force=push.force if push else None, devices=devices)
     check_fits(policy, player, path)
-    source = calibration.Stream(
-        char, opt.axes, sample_rate=opt.sample_rate, grip=opt.grip, user_height=opt.user_height, devices=read
-    )  # fmt: skip
+    source, said = source_of(char, opt.stream, read, opt)
     reader = Reader("standard input" if opt.stream == "-" else opt.stream, strict=not live, devices=read)
     samples = reader.read(lines_of(opt.stream))
+    if live:  # a file's axes were looked at before
+        samples = watched(samples, axes.Watch(source.axes, source.grip, source.unit, tuple(source.order), read))
+    print(*said, sep="\n", end="\n" if said else "", flush=True)
     pace = Pace(player.dt) if opt.realtime or opt.view else None
     if live and pace:
         samples = arriving(samples, GAP, player.dt)
@@ -344,19 +363,38 @@ def recordings_of(path) -> list[Path]:
     return files
 
 
+def source_of(char: Character, path, devices: int, opt: Options):
+    """The stream's reading as the options say, or as fits it best; and what to say about that.
+
+    Test      tests/headset/test_stream.py::test_axes_are_found"""
+    order = tuple(map(DEVICES.index, opt.devices))
+    how = axes.choose(path, opt.axes, opt.grip, opt.stream_unit, order, devices)
+    source = calibration.Stream(
+        char,
+        how.axes,
+        sample_rate=opt.sample_rate,
+        grip=how.grip,
+        user_height=opt.user_height,
+        devices=devices,
+        unit=how.unit,
+        order=how.order,
+    )
+    return source, how.lines
+
+
 def ticks_of(char: Character, path, devices: int, opt: Options):
     """What a recording comes to: pos (T, 3, 3), quat (T, 3, 4) at the control rate, in the character's world.
 
     Raises    UserError: it cannot be read, or shows no headset for a second
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
-    source = calibration.Stream(
-        char, opt.axes, sample_rate=opt.sample_rate, grip=opt.grip, user_height=opt.user_height, devices=devices
-    )
+    source, said = source_of(char, path, devices, opt)
     reader, ticks = Reader(str(path), devices=devices), []
     for sample in reader.read(lines_of(path)):
         ticks += source.push(sample)
     if not ticks:
         raise UserError(f"{path}: {source.uncalibrated()}")
+    if opt.axes != "auto" or source.axes != "unity":  # what was found otherwise, or does not fit
+        print(*(f"{path}: {line}" for line in said), sep="\n", end="\n" if said else "")
     ticks = ticks[: round(opt.seconds * CONTROL_RATE) if opt.seconds else None]
     return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks])
 

@@ -952,3 +952,23 @@ def test_real_recordings(jesse, sensors_dir, name):
     assert np.linalg.norm(pos[:, 1:] - pos[:, :1], axis=-1).max() < 1.2
     assert "the stream's" in source.report()[0]  # one of them is 1.97 m up
     assert np.isfinite(pos).all() and not source.guard.events["head", "teleport"]
+
+
+def test_axes_are_found(jesse, walk, capsys):
+    """A file in Unity's axes is read so by itself, and says so where they are others; a live stream is watched."""
+    from headset import axes
+    from headset.reader import GRIP
+
+    pos, quat = sensors(walk)
+    m = AXES["unity"]
+    held = quat.copy()
+    held[:, 1:] = quat_mul(held[:, 1:], quat_about(1, np.radians(90.0 - GRIP["unity"])))
+    vector = np.round(np.linalg.det(m)) * (held[..., 1:] @ m)
+    rows = np.concatenate([vector, held[..., :1]], axis=-1)
+    samples = [Sample(k / walk.rate, pos[k] @ m, rows[k]) for k in range(len(pos))]
+    assert list(play.watched(samples, axes.Watch("unity"))) == samples
+    assert capsys.readouterr().out == ""
+    list(play.watched(samples, axes.Watch("mujoco")))
+    assert "--axes" in capsys.readouterr().out
+    found = axes.guess(samples)
+    assert found.axes == "unity" and found.order == (0, 1, 2)
