@@ -323,7 +323,7 @@ class Env:
     threads   : physics threads, 0 = all cores; results do not depend on it
     horizon   : control steps to truncation
     disturbance : what training adds to sensors and bodies (`extras.train.Disturbance`); nothing by default
-    starts    : where episodes start, `Uniform` by default; root_limit : of `too_far` [m]
+    starts    : where episodes start, `Uniform` by default; root_limit : of `too_far` [m], or (F,) by frames
     asymmetric : the critic's observation has more than the actor's [§5.3]
     autoreset : start anew where an episode ended; without it the caller resets, and reads the state that ended
     """
@@ -423,7 +423,7 @@ class Env:
         Test      tests/test_env.py::test_standing_starts"""
         ref, f = self.ref, self.frame[ids]
         pose = standing(self.char, ref.sensor_pos[f, 0], ref.sensor_quat[f, 0])
-        near = ~too_far(pose[:, :3], ref.qpos[f, :3], self.root_limit)
+        near = ~too_far(pose[:, :3], ref.qpos[f, :3], np.broadcast_to(self.root_limit, len(ref))[f])
         ids, f = ids[near], f[near]
         self.qpos[ids], self.qvel[ids] = pose[near], 0.0
         self.qvel[ids, :2] = (ref.sensor_pos[f, 0] - ref.sensor_pos[f - 1, 0])[:, :2] / self.dt
@@ -471,7 +471,8 @@ class Env:
             terms = {name: np.where(bad, 0.0, value) for name, value in terms.items()}
         lowest = geom_lowest(self.char.model, self.char.fall_geoms, self.geom_xpos, self.geom_xmat).min(1)
         ends = {"fall": fallen(lowest) & ~bad, "bad": bad}
-        ends["far"] = too_far(self.qpos[:, :3], self.ref.qpos[f, :3], self.root_limit) & ~bad & ~ends["fall"]
+        late = too_far(self.qpos[:, :3], self.ref.qpos[f, :3], np.broadcast_to(self.root_limit, len(self.ref))[f])
+        ends["far"] = late & ~bad & ~ends["fall"]
         terminated = ends["fall"] | ends["far"] | ends["bad"]
         ends["clip"] = (f >= self.ref.last[self.sequence]) & ~terminated
         ends["time"] = (self.steps >= self.horizon) & ~terminated & ~ends["clip"]

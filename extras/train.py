@@ -40,7 +40,8 @@ from policy import initial, widths
 from retarget import Reference
 
 RETRY, PLACES = (3, 60), 512  # ASSUMED: steps before a failure from which it is tried again; failures remembered
-MOST = 10.0  # ASSUMED: a beginning that fails more often than so many times the mean is drawn no more often for it
+LATE = 1.5  # ASSUMED: s for which a fast user excuses that the character is late
+MOST = 2.0  # ASSUMED: a beginning that fails more often than so many times the mean is drawn no more often for it
 SHORTEST = 1.0  # s of a clip that is made a visit
 PLAYERS_STAND = 1.5  # ASSUMED: s at a recording's beginning in which a player stands well enough to start under
 PUSH_SECONDS = 2.0  # mean time between pushes
@@ -67,6 +68,7 @@ class Options(ppo.Options):
     sensor_noise: float = arg(0.0, "white noise on device positions [m]", check=NONNEGATIVE)
     push: float = arg(0.0, "largest random push, every 2 s on average [m/s]", check=NONNEGATIVE)
     root_limit: float = arg(ROOT_LIMIT, "an episode ends as far from the root's target [§3.6: 0.30 m]", check=POSITIVE)
+    root_lag: float = arg(0.0, "and as far again as the user went in so many seconds, of late", check=NONNEGATIVE)
     episode: int = arg(EPISODE_STEPS, "control steps to truncation [§3.6]", check=POSITIVE)
     solver: str = arg("pgs", "of contacts: pgs, or newton, exact, as when playing", tuple(character.SOLVERS))
     gpu: bool = arg(False, "train on an NVIDIA GPU (extra gpu); give thousands of --envs")
@@ -349,6 +351,22 @@ def read_reference(path, char) -> Reference:
 # ------------------------------------------------------------------------------------ training
 
 
+def patience(ref: Reference, limit, lag):
+    r"""How far from its target the root may be at each frame: farther under a fast user than under one who stands.
+
+    Equation  limit + lag × the user's highest speed in the last LATE seconds
+    Why       with one limit for all, a character that may be late for a run may also wander off from a user who waves
+    Returns   (F,) [m]
+    Test      tests/extras/test_train.py::test_patience"""
+    speed = np.linalg.norm(ref.qvel[:, :2], axis=1)
+    out = np.empty(len(ref))
+    n = round(LATE * ref.rate)
+    for a, b in zip(ref.first, ref.last, strict=True):
+        part = np.concatenate([np.zeros(n - 1), speed[a : b + 1]])
+        out[a : b + 1] = np.lib.stride_tricks.sliding_window_view(part, n).max(axis=1)
+    return limit + lag * out
+
+
 def make_env(opt: Options) -> Env:
     """The character, its motions, and the curriculum, as `ppo.make_env` without the last.
 
@@ -368,7 +386,7 @@ def make_env(opt: Options) -> Env:
         disturbance=Disturbance(opt.envs, ref.sensor_pos.shape[1], **added) if any(added.values()) else None,
         asymmetric="asymmetric" not in opt.without,
         starts=Curriculum(ref, opt.episode, **starts) if any(starts.values()) else None,
-        root_limit=opt.root_limit,
+        root_limit=patience(ref, opt.root_limit, opt.root_lag) if opt.root_lag else opt.root_limit,
     )
 
 

@@ -262,6 +262,21 @@ def test_clips(tmp_path, capsys):
     assert "making visits of 1 clips" in capsys.readouterr().out
 
 
+def test_patience(ref):
+    """The limit under a standing user, and more by the fastest of the last second and a half, sequence by sequence."""
+    speed = np.linalg.norm(ref.qvel[:, :2], axis=1)
+    found = train.patience(ref, 0.4, 0.2)
+    for a, b in zip(ref.first, ref.last):
+        for f in range(a, b + 1, 7):
+            assert found[f] == pytest.approx(0.4 + 0.2 * speed[max(a, f - 44) : f + 1].max())
+    env = Env(character.load("jesse"), ref, 4, threads=1, root_limit=found, autoreset=False)
+    env.reset(frames=[int(ref.first[0])] * 4)
+    limit = found[ref.first[0] + 1]
+    env.qpos[:, 0] += [0.0, limit - 0.05, limit + 0.05, 3.0]
+    far = env.step(np.zeros((4, env.action_size)))[4]["ends"]["far"]
+    assert far.tolist() == [False, False, True, True]
+
+
 def test_players(monkeypatch, tmp_path):
     """Recordings with bodies: each as two visits, and as it is, to be started under while the player stands."""
     person = data.builtin_clips()[2][:90]
@@ -423,7 +438,7 @@ def test_ppo_hands_on(tmp_path, capsys):
     ppo.main(["--character", "oppy", *tiny, "--steps", "64", "--out", str(out)])
     assert capsys.readouterr().out.startswith("trained by extras.train")
     config = read_config(out)["config"]
-    assert config["by"] == "extras.train" and config["balance"] is True and config["root_limit"] == 0.9
+    assert config["by"] == "extras.train" and config["balance"] is True and config["root_limit"] == 0.45
     assert config["hidden"] == [12] and config["sigma"] == 0.06
     ppo.main(["--resume", "--out", str(out), "--steps", "128"])
     arrays, meta = load_checkpoint(out / CHECKPOINT)
