@@ -348,7 +348,7 @@ class Env:
         root_limit=ROOT_LIMIT,
     ):
         self.char, self.ref, self.n, self.horizon, self.substeps = char, ref, n, horizon, substeps
-        self.name, self.disturbance, self.root_limit = char.name, disturbance, root_limit
+        self.name, self.disturbance, self.root_limit = char.name, disturbance, np.broadcast_to(root_limit, len(ref))
         self.starts = starts or Uniform(ref)
         self.parts = {"starts": self.starts} | ({"disturbance": disturbance} if disturbance else {})
         self.autoreset, self.dt = autoreset, 1.0 / ref.rate
@@ -423,7 +423,7 @@ class Env:
         Test      tests/test_env.py::test_standing_starts"""
         ref, f = self.ref, self.frame[ids]
         pose = standing(self.char, ref.sensor_pos[f, 0], ref.sensor_quat[f, 0])
-        near = ~too_far(pose[:, :3], ref.qpos[f, :3], np.broadcast_to(self.root_limit, len(ref))[f])
+        near = ~too_far(pose[:, :3], ref.qpos[f, :3], self.root_limit[f])
         ids, f = ids[near], f[near]
         self.qpos[ids], self.qvel[ids] = pose[near], 0.0
         self.qvel[ids, :2] = (ref.sensor_pos[f, 0] - ref.sensor_pos[f - 1, 0])[:, :2] / self.dt
@@ -471,8 +471,7 @@ class Env:
             terms = {name: np.where(bad, 0.0, value) for name, value in terms.items()}
         lowest = geom_lowest(self.char.model, self.char.fall_geoms, self.geom_xpos, self.geom_xmat).min(1)
         ends = {"fall": fallen(lowest) & ~bad, "bad": bad}
-        late = too_far(self.qpos[:, :3], self.ref.qpos[f, :3], np.broadcast_to(self.root_limit, len(self.ref))[f])
-        ends["far"] = late & ~bad & ~ends["fall"]
+        ends["far"] = too_far(self.qpos[:, :3], self.ref.qpos[f, :3], self.root_limit[f]) & ~bad & ~ends["fall"]
         terminated = ends["fall"] | ends["far"] | ends["bad"]
         ends["clip"] = (f >= self.ref.last[self.sequence]) & ~terminated
         ends["time"] = (self.steps >= self.horizon) & ~terminated & ~ends["clip"]

@@ -391,7 +391,7 @@ def test_damaged_cache(tmp_path, monkeypatch, capsys):
 def test_switches_reach_the_environment(tmp_path):
     opt = small(tmp_path / "a")
     plain, again = train.make_env(opt), train.make_env(opt)
-    assert type(plain.starts) is Uniform and plain.disturbance is None and plain.root_limit == 0.30
+    assert type(plain.starts) is Uniform and plain.disturbance is None and (plain.root_limit == 0.30).all()
     assert motions(plain.ref) == motions(again.ref) == motions(ppo.make_env(opt).ref)
     more = dict(sensor_offset=0.02, sensor_noise=0.01, push=0.3, root_limit=0.5, episode=77, solver="newton")
     more |= dict(balance=True, stand=0.2, sensors="hmd", without=("contact", "asymmetric"))
@@ -399,7 +399,7 @@ def test_switches_reach_the_environment(tmp_path):
     d, s = env.disturbance, env.starts
     assert (d.sensor_offset, d.sensor_noise, d.push, d.error.shape) == (0.02, 0.01, 0.3, (5, 3, 3))
     assert (s.balance, s.retry, s.stand, s.begin, s.horizon) == (True, 0.0, 0.2, 0.0, 77)
-    assert (env.n, env.horizon, env.root_limit, env.devices, env.asymmetric) == (5, 77, 0.5, 1, False)
+    assert (env.n, env.horizon, env.root_limit[0], env.devices, env.asymmetric) == (5, 77, 0.5, 1, False)
     assert {t for t in TERMS if env.char.reward[t][0] == 0} == {"contact"}
     assert env.char.model.opt.iterations == 100 != plain.char.model.opt.iterations
     other = train.make_env(replace(opt, augment=True))

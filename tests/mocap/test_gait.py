@@ -288,4 +288,4 @@ def test_inspect_prints_a_table(capsys):
     for name, clips in (("builtin", "turn_006 stand_007"), ("standing", "stand_003 stop_004")):
         inspect.main(["inspect", name])
         out = capsys.readouterr().out
-        assert all(clip in out for clip in clips.split()) and f"{name} [all] 20 clips" in out
+        assert all(clip in out for clip in clips.split()) and f"{name} [all] 30 clips" in out
