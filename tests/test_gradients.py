@@ -32,7 +32,8 @@ def pair(name, **settings):
     """A row of the table; `name` is what it checks, as module.function or module.Class."""
 
     def add(make):
-        label = f"{name}[{','.join(map(str, settings.values()))}]" if settings else name
+        plain = [str(v) for v in settings.values() if not callable(v)]
+        label = f"{name}[{','.join(plain)}]" if plain else name
         ROWS[label] = lambda rng: make(rng, **settings)
         return make
 
@@ -41,6 +42,11 @@ def pair(name, **settings):
 
 def normals(rng, **shapes):
     return {name: rng.standard_normal(shape) for name, shape in shapes.items()}
+
+
+def loss_of(loss, arrays):
+    """A row of a function that returns its value, then a gradient an array, then what else."""
+    return arrays, lambda **a: loss(**a)[0], lambda up, **a: {k: up * d for k, d in zip(a, loss(**a)[1:])}
 
 
 def outputs_of(y):
@@ -85,11 +91,10 @@ def linear(rng):
     return normals(rng, x=(6, 4), W=(4, 3), b=(3,)), lambda x, W, b: nn.linear_forward(x, W, b)[0], backward
 
 
-@pair("nn.leaky_relu", module=nn, name="leaky_relu")
-@pair("nn.tanh", module=nn, name="tanh")
-@pair("layers.leaky", module=layers, name="leaky")
-def activation(rng, module, name):
-    forward, back = (getattr(module, f"{name}_{way}") for way in ("forward", "backward"))
+@pair("nn.leaky_relu", forward=nn.leaky_relu_forward, back=nn.leaky_relu_backward)
+@pair("nn.tanh", forward=nn.tanh_forward, back=nn.tanh_backward)
+@pair("layers.leaky", forward=layers.leaky_forward, back=layers.leaky_backward)
+def activation(rng, forward, back):
     x = rng.standard_normal((6, 5, 2))
     x += 0.05 * np.sign(x)  # away from the kink
     return {"x": x}, lambda x: forward(x)[0], lambda dy, x: {"x": back(dy, forward(x)[1])[0]}
@@ -139,7 +144,7 @@ def gaussian_entropy(rng):
 @pair("nn.value_loss", shape=(8, 1))
 def value_loss(rng, shape):
     target = rng.standard_normal(shape)
-    return normals(rng, v=shape), lambda v: nn.value_loss(v, target)[0], lambda up, v: {"v": up * nn.value_loss(v, target)[1]}
+    return loss_of(lambda v: nn.value_loss(v, target), normals(rng, v=shape))
 
 
 # ------------------------------------------------------------------------------------ ppo.py
@@ -147,12 +152,8 @@ def value_loss(rng, shape):
 
 @pair("ppo.clipped_surrogate")
 def clipped_surrogate(rng):
-    logp, logp_old, adv = surrogate_batch(rng)
-
-    def loss(logp):
-        return ppo.clipped_surrogate(logp, logp_old, adv, 0.2)
-
-    return {"logp": logp}, lambda logp: loss(logp)[0], lambda up, logp: {"logp": up * loss(logp)[1]}
+    logp, logp_old, adv = surrogate_batch(rng)  # both sides of both limits, away from the kinks
+    return loss_of(lambda logp: ppo.clipped_surrogate(logp, logp_old, adv, 0.2), {"logp": logp})
 
 
 @pair("ppo.policy_loss")
@@ -165,7 +166,7 @@ def policy_loss(rng):
 
     theta = policy.theta_pi.copy()
     assert np.all(loss(theta)[1][-3:] != 0)
-    return {"theta": theta}, lambda theta: loss(theta)[0], lambda up, theta: {"theta": up * loss(theta)[1]}
+    return loss_of(loss, {"theta": theta})
 
 
 @pair("ppo.critic_loss")
@@ -177,7 +178,7 @@ def critic_loss(rng):
         return ppo.critic_loss(policy, x, target)
 
     theta = policy.critic.theta.copy()
-    return {"theta": theta}, lambda theta: loss(theta)[0], lambda up, theta: {"theta": up * loss(theta)[1]}
+    return loss_of(loss, {"theta": theta})
 
 
 # ------------------------------------------------------------------------------------ drop/vae.py
@@ -214,7 +215,8 @@ def kl(rng):
     def backward(up, **four):
         return {name: up[:, None] * d for name, d in zip(names, vae.kl_forward(**four)[1])}
 
-    return {name: 0.5 * rng.standard_normal((2, 3)) for name in names}, lambda **four: vae.kl_forward(**four)[0], backward
+    arrays = {name: 0.5 * rng.standard_normal((2, 3)) for name in names}
+    return arrays, lambda **four: vae.kl_forward(**four)[0], backward
 
 
 @pair("vae.LatentMLP")
@@ -363,13 +365,17 @@ def fk(rng, outputs):
 # ------------------------------------------------------------------------------------ skeletal/net.py
 
 
-@pair("net.Generator", setting=())
-@pair("net.Generator", setting=(("pool", "max"),))
-@pair("net.Generator", setting=(("plain", True),))
-@pair("net.Generator", setting=(("choices", layers.CHOICES["paper"]),))
-def generator(rng, setting):
+GENERATORS = {"ours": {}, "max": {"pool": "max"}, "plain": {"plain": True}}
+GENERATORS["paper"] = {"choices": layers.CHOICES["paper"]}
+
+
+@pair("net.Generator", kind="ours")
+@pair("net.Generator", kind="max")
+@pair("net.Generator", kind="plain")
+@pair("net.Generator", kind="paper")
+def generator(rng, kind):
     """Static branch, encoder and decoder together: latent and result, by the motion and all weights."""
-    own = net.Generator(SMALL, rng, channels=(2, 3), dtype=np.float64, **dict(setting))
+    own = net.Generator(SMALL, rng, channels=(2, 3), dtype=np.float64, **GENERATORS[kind])
     s = rng.standard_normal((3 * len(SMALL), 2))
 
     def run(x, theta):
@@ -377,6 +383,7 @@ def generator(rng, setting):
         f, static = own.static_forward(s)
         z, encoded = own.encode_forward(x, f)
         y, decoded = own.decode_forward(z, f)
+        assert y.shape == x.shape
         return (z, y), (static, encoded, decoded)
 
     def backward(dz, dy, x, theta):
@@ -406,11 +413,6 @@ def critic(rng):
 
     theta = own.theta + 0.1 * rng.standard_normal(own.n_params)
     return normals(rng, bones=(24, 16, 3)) | {"theta": theta}, lambda **a: run(**a)[0], backward
-
-
-def loss_of(loss, arrays):
-    """A row of a function that returns its value, then a gradient an array."""
-    return arrays, lambda **a: loss(**a)[0], lambda up, **a: {k: up * d for k, d in zip(a, loss(**a)[1:], strict=True)}
 
 
 @pair("net.mse")
