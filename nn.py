@@ -63,7 +63,7 @@ def linear_forward(x, W, b):
     Returns   y : (B, n_out); cache for `linear_backward`. It holds x and W by reference: change neither
               before the backward pass.
     Raises    ValueError: shapes do not fit
-    Test      tests/test_nn.py::test_linear_gradients
+    Test      tests/test_nn.py::test_linear
     """
     _check_shape("W", W, ("n_in", "n_out"))
     _check_shape("b", b, W.shape[1:])
@@ -82,7 +82,7 @@ def linear_backward(dy, cache, want_dx=True):
               which the first layer of a network does not need
     Returns   dx : (B, n_in) or None; grads : (dW (n_in, n_out), db (n_out,)), summed over the batch
     Raises    ValueError: dy does not have the shape of y
-    Test      tests/test_nn.py::test_linear_gradients
+    Test      tests/test_gradients.py::test_backward
     """
     x, W = cache
     dy = np.asarray(dy, dtype=W.dtype)
@@ -97,7 +97,7 @@ def leaky_relu_forward(x):
     Equation  y = max(x, s x), s = LEAKY_SLOPE
     Args      x : any shape
     Returns   y : shape of x; cache for `leaky_relu_backward`
-    Test      tests/test_nn.py::test_activation_gradients
+    Test      tests/test_nn.py::test_activations
     """
     y = LEAKY_SLOPE * x
     np.maximum(x, y, out=y)
@@ -111,7 +111,7 @@ def leaky_relu_backward(dy, cache):
     Args      dy : shape of y; cache : from `leaky_relu_forward`
     Returns   dx : shape of y; grads : (), the layer has no parameters
     Raises    ValueError: dy does not have the shape of y
-    Test      tests/test_nn.py::test_activation_gradients
+    Test      tests/test_gradients.py::test_backward
     """
     y = cache
     _check_shape("dy", dy, y.shape)
@@ -126,7 +126,7 @@ def tanh_forward(x):
     Equation  y = tanh(x)
     Args      x : any shape
     Returns   y : shape of x; cache for `tanh_backward`
-    Test      tests/test_nn.py::test_activation_gradients
+    Test      tests/test_nn.py::test_activations
     """
     y = np.tanh(x)
     return y, y
@@ -139,7 +139,7 @@ def tanh_backward(dy, cache):
     Args      dy : shape of y; cache : from `tanh_forward`
     Returns   dx : shape of y; grads : (), the layer has no parameters
     Raises    ValueError: dy does not have the shape of y
-    Test      tests/test_nn.py::test_activation_gradients
+    Test      tests/test_gradients.py::test_backward
     """
     y = cache
     _check_shape("dy", dy, y.shape)
@@ -182,7 +182,7 @@ class MLP:
               gain : of the output layer. ASSUMED [Huang22, detail 2]: 0.01 for a policy, so that it starts
               near zero, and 1 for a value. dtype : float32, or float64 in gradient tests
     Raises    ValueError: fewer than two sizes, a size below 1, or an unknown activation
-    Test      tests/test_nn.py::test_mlp_gradients, test_mlp_matches_torch
+    Test      tests/test_nn.py::test_mlp, test_mlp_matches_torch
 
     ASSUMED: orthogonal weights [Saxe14] and zero biases, as most PPO code does [Huang22, detail 2].
 
@@ -240,7 +240,7 @@ class MLP:
         Returns   y : (B, n_n); cache for `backward`. It refers to x and theta: call `backward` before either
                   changes.
         Raises    ValueError: x is not (B, n_0)
-        Test      tests/test_nn.py::test_mlp_gradients
+        Test      tests/test_nn.py::test_mlp
         """
         # Fresh arrays for each call: reused buffers would save little (the allocator hands the same pages
         # back), and a second forward pass would overwrite the cache of the first.
@@ -260,7 +260,7 @@ class MLP:
         Args      dy : (B, n_n); cache : from `forward`; want_dx : False saves the product for the input
         Returns   dx : (B, n_0) or None; dtheta : (P,), laid out as theta, summed over the batch
         Raises    ValueError: dy does not have the shape of y
-        Test      tests/test_nn.py::test_mlp_gradients
+        Test      tests/test_gradients.py::test_backward
         """
         act_backward = ACTIVATIONS[self.activation][1]
         dtheta = np.empty_like(self.theta)  # (P,)
@@ -329,7 +329,7 @@ def gaussian_logp_backward(dlogp, a, mu, log_std):
     Args      dlogp : (B,) d loss / d logp; a, mu, log_std : as in `gaussian_logp`
     Returns   dmu : (B, A); dlog_std : (A,), summed over the batch
     Raises    ValueError: shapes differ
-    Test      tests/test_nn.py::test_gaussian_logp_gradients
+    Test      tests/test_gradients.py::test_backward
     """
     a, mu, log_std = _gaussian_args(a, mu, log_std)
     dlogp = np.asarray(dlogp, dtype=mu.dtype)
@@ -362,7 +362,7 @@ def gaussian_entropy_backward(dentropy, log_std):
     Args      dentropy : float, d loss / d H; log_std : (A,)
     Returns   dlog_std : (A,), dtype of log_std
     Raises    ValueError: log_std is not (A,)
-    Test      tests/test_nn.py::test_gaussian_entropy
+    Test      tests/test_gradients.py::test_backward
     """
     _check_shape("log_std", log_std, ("A",))
     return np.full_like(log_std, dentropy)
@@ -394,7 +394,7 @@ def value_loss(v, target):
               is an error.
     Returns   loss : float; dv : shape and dtype of v
     Raises    ValueError: shapes differ, or there are no values
-    Test      tests/test_nn.py::test_value_loss
+    Test      tests/test_nn.py::test_value_loss, tests/test_gradients.py::test_backward
     """
     v = np.asarray(v)
     target = np.asarray(target, dtype=v.dtype)

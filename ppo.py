@@ -119,7 +119,7 @@ def clipped_surrogate(logp, logp_old, adv, eps):
     Args      logp, logp_old : (B,) float32 [nat]; adv : (B,) float32 [-], standardised
     Returns   loss : float; dlogp : (B,) d loss / d logp; ratio : (B,)
     Raises    ValueError: shapes differ, or eps outside (0, 1)
-    Test      tests/test_ppo.py::test_clipped_surrogate
+    Test      tests/test_ppo.py::test_clipped_surrogate, tests/test_gradients.py::test_backward
     """
     if not (np.shape(logp) == np.shape(logp_old) == np.shape(adv)):
         raise ValueError(f"shapes differ: logp {np.shape(logp)}, logp_old {np.shape(logp_old)}, adv {np.shape(adv)}")
@@ -147,7 +147,7 @@ def policy_loss(policy: Policy, x, action, logp_old, adv, eps):
     Equation  −L(θ) of Appendix B, π_θ = N(μ_θ(o), diag σ²)
     Args      x (B, obs), normalised; action (B, u), unclipped; logp_old, adv (B,)
     Returns   loss : float; gradient (P,) laid out as policy.theta_pi; dict(mu, ratio)
-    Test      tests/test_ppo.py::test_policy_loss_gradient
+    Test      tests/test_ppo.py::test_policy_loss, tests/test_gradients.py::test_backward
     """
     mu, cache = policy.actor.forward(x)
     logp = gaussian_logp(action, mu, policy.log_std)
@@ -162,7 +162,7 @@ def critic_loss(policy: Policy, x, target):
 
     Args      x (B, critic), normalised; target (B,), in units of policy.value_scale
     Returns   loss : float; gradient (P,)
-    Test      tests/test_ppo.py::test_critic_loss_gradient
+    Test      tests/test_ppo.py::test_critic_loss, tests/test_gradients.py::test_backward
     """
     v, cache = policy.critic.forward(x)
     loss, dv = value_loss(v[:, 0], target)

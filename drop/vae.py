@@ -66,7 +66,7 @@ def gram_schmidt_backward(dC, cache):
               db = d − (c1·d) c1, dc1 −= s d + (c1·d) b;  da = (dc1 − (dc1·c1) c1)/‖a‖
     Args      dC : (..., 3, 3)
     Returns   (..., 2, 3)
-    Test      tests/drop/test_drop_vae.py::test_gram_schmidt
+    Test      tests/test_gradients.py::test_backward
     """
     C, b, s, na, nb = cache
     c1, c2, (dc1, dc2, dc3) = C[..., 0, :], C[..., 1, :], np.moveaxis(dC, -2, 0)
@@ -108,7 +108,7 @@ def kinematics_backward(dx):
     Equation  droot = Σ_j dx_j;  dbones = PATHᵀ dx;  dc_k of a joint = Σ over its bones o_ik dbone_i
     Args      dx : (B, 22, 3)
     Returns   droot (B, 3), dC (B, 22, 3, 3)
-    Test      tests/drop/test_drop_vae.py::test_kinematics
+    Test      tests/test_gradients.py::test_backward
     """
     dbones = np.matmul(_PATHS[dx.dtype].T, dx)
     dC = np.zeros((len(dx), N, 3, 3), dx.dtype)
@@ -226,7 +226,7 @@ def bounded_forward(raw):
 
 
 def bounded_backward(dlog_std, t):
-    """Gradient of `bounded_forward`.  Test: tests/drop/test_drop_vae.py::test_gaussians"""
+    """Gradient of `bounded_forward`.  Test: tests/test_gradients.py::test_backward"""
     return dlog_std * (1.0 - t * t)
 
 
@@ -236,7 +236,7 @@ def kl_forward(mu0, log_std0, mu1, log_std1):
     Equation  Σ log(σ1/σ0) + (σ0² + (μ0 − μ1)²)/(2 σ1²) − ½
     Args      (B, Z) each
     Returns   KL (B,) [nat]; (dμ0, dlog σ0, dμ1, dlog σ1), each d KL / d its argument
-    Test      tests/drop/test_drop_vae.py::test_gaussians
+    Test      tests/drop/test_drop_vae.py::test_gaussians, tests/test_gradients.py::test_backward
     """
     inv = np.exp(-2.0 * log_std1)
     ratio, d = np.exp(2.0 * (log_std0 - log_std1)), mu0 - mu1
@@ -252,7 +252,7 @@ class LatentMLP(MLP):
 
     Equation  h_0 = x, h_{i+1} = act([h_i, z] W_i + b_i), y = [h_{n−1}, z] W_{n−1} + b_{n−1}
     Args      sizes : inputs without z first; latent : entries of z; gain : of the output layer
-    Test      tests/drop/test_drop_vae.py::test_latent_mlp_gradients
+    Test      tests/drop/test_drop_vae.py::test_latent_mlp, tests/test_gradients.py::test_backward
     """
 
     def __init__(self, sizes, latent, rng, gain=1.0, dtype=np.float32):
@@ -300,7 +300,7 @@ class MotionVAE:
     Symbols   s_t -> normalised state, z -> (B, latent); `nets` prior, posterior, decoder
     Args      latent, hidden : sizes; statistics : mean, std (STATE,) of states, scale (OUTPUT,) and offset of residuals
     ASSUMED   the sizes; two hidden layers each; HuMoR's have latent 48 and up to 1024 units
-    Test      tests/drop/test_drop_vae.py::test_motion_vae_gradients
+    Test      tests/drop/test_drop_vae.py::test_motion_vae, tests/test_gradients.py::test_backward
     """
 
     def __init__(self, latent, hidden, statistics, rng, dtype=np.float32):
@@ -337,7 +337,7 @@ class MotionVAE:
     def decode(self, s, z, height, columns):
         """The next frame in the heading frame of this one: x (B, 22, 3), C (B, 22, 3, 3).
 
-        Test: tests/drop/test_drop_vae.py::test_motion_vae_gradients"""
+        Test: tests/drop/test_drop_vae.py::test_motion_vae"""
         move, change = self.residual(self.nets["decoder"](s, z))
         C, _ = gram_schmidt_forward(columns + change)
         root = move.copy()
@@ -352,7 +352,7 @@ class MotionVAE:
         Args      state (B, STATE) not normalised; height (B,), columns (B, 22, 2, 3) of this frame; x_next,
                   columns_next the target, in the heading frame of this one; eps (B, latent) standard normal
         Returns   parts : {reconstruction, kl} [nat], means; dtheta by net; x̃, C of the reconstruction
-        Test      tests/drop/test_drop_vae.py::test_motion_vae_gradients
+        Test      tests/drop/test_drop_vae.py::test_motion_vae
         """
         b, stats = len(state), self.stats
         s = self.normalise(state)
@@ -402,7 +402,7 @@ def pose_columns(C):
     Equation  R' = R_pelvisᵀ R_j, joints POSE
     Args      C : (B, 22, 3, 3), rows are columns of global rotations
     Returns   (B, 16, 2, 3)
-    Test      tests/drop/test_drop_vae.py::test_pose_vae_gradients
+    Test      tests/drop/test_drop_vae.py::test_pose_vae
     """
     return np.matmul(C[:, POSE, :2], np.swapaxes(C[:, :1], -1, -2))
 
@@ -413,7 +413,7 @@ class PoseVAE:
     Symbols   E -> encoder's mean, D -> decoder; z (B, latent); the prior of z is N(0, I)
     Args      latent, hidden : sizes; mean, std : (POSE_SIZE,) of the columns
     ASSUMED   sizes, two hidden layers each; KL weight 1 against a likelihood of SIGMA_X, SIGMA_R
-    Test      tests/drop/test_drop_vae.py::test_pose_vae_gradients
+    Test      tests/drop/test_drop_vae.py::test_pose_vae, tests/test_gradients.py::test_backward
     """
 
     def __init__(self, latent, hidden, statistics, rng, dtype=np.float32):
@@ -450,7 +450,7 @@ class PoseVAE:
         Args      pose (B, 16, 2, 3); x (B, 22, 3) its joints relative to the pelvis, in the pelvis's frame;
                   eps (B, latent)
         Returns   parts, dtheta by net
-        Test      tests/drop/test_drop_vae.py::test_pose_vae_gradients
+        Test      tests/drop/test_drop_vae.py::test_pose_vae
         """
         b = len(pose)
         out, encoder_cache = self.nets["encoder"].forward(self._normalise(pose))

@@ -294,7 +294,8 @@ def conv_forward(x, s, weights, plan: ConvPlan):
               plan : ConvPlan.  T must be a multiple of the stride and longer than half a kernel
     Returns   y : (C_out, T / stride, B); cache
     Raises    ValueError: shapes do not fit
-    Test      tests/skeletal/test_skeletal.py::test_conv_equals_slow_loop, test_conv_gradients, test_conv_matches_torch
+    Test      tests/skeletal/test_skeletal.py::test_conv_equals_slow_loop, test_conv_matches_torch,
+              tests/test_gradients.py::test_backward
     """
     W, V, b = weights
     C, T, B = x.shape
@@ -334,7 +335,7 @@ def conv_backward(dy, cache, want_dx=True):
     Equation  with dY_k(u) = dy(u - k): dW = dY x^T, dx = W^T dY; dV = (sum_t dy) s^T, ds = V^T sum_t dy, db = sum dy
     Args      dy : (C_out, T / stride, B); want_dx : False where the input is data
     Returns   (dx (C_in, T, B) or None, ds (C_static, B) or None); grads : (dW, dV, db) as the weights
-    Test      tests/skeletal/test_skeletal.py::test_conv_gradients, test_conv_matches_torch
+    Test      tests/test_gradients.py::test_backward, tests/skeletal/test_skeletal.py::test_conv_matches_torch
     """
     phases, s, (W, V, _), plan, T = cache
     stride, half = plan.stride, plan.kernel // 2
@@ -398,7 +399,7 @@ def pool_forward(x, groups, how="mean"):
     Args      x : (J c, ...); groups : members of every new armature; how : "mean" or "max"
     Returns   y : (J' c, ...); cache
     Raises    ValueError: another word than mean or max
-    Test      tests/skeletal/test_skeletal.py::test_pool_gradients
+    Test      tests/skeletal/test_skeletal.py::test_pool
     """
     if how not in ("mean", "max"):
         raise ValueError(f"pooling {how!r}; expected 'mean' or 'max'")
@@ -412,7 +413,7 @@ def pool_forward(x, groups, how="mean"):
 def pool_backward(dy, cache):
     """Gradient of `pool_forward`: shared equally, or to the largest.
 
-    Test      tests/skeletal/test_skeletal.py::test_pool_gradients
+    Test      tests/test_gradients.py::test_backward
     """
     groups, best, J = cache
     d = dy.reshape(len(groups), -1, *dy.shape[1:])
@@ -426,7 +427,7 @@ def pool_backward(dy, cache):
 def unpool_forward(x, groups):
     """[SAN §4.3] Every armature of a group gets the group's features.  x (J' c, ...) -> (J c, ...).
 
-    Test: tests/skeletal/test_skeletal.py::test_unpool_gradients"""
+    Test: tests/skeletal/test_skeletal.py::test_unpool"""
     owner = np.empty(sum(map(len, groups)), int)
     for k, g in enumerate(groups):
         owner[g] = k
@@ -437,7 +438,7 @@ def unpool_forward(x, groups):
 def unpool_backward(dy, cache):
     """Gradient of `unpool_forward`: the sum over a group.
 
-    Test      tests/skeletal/test_skeletal.py::test_unpool_gradients"""
+    Test      tests/test_gradients.py::test_backward"""
     groups = cache
     d = dy.reshape(sum(map(len, groups)), -1, *dy.shape[1:])
     dx = np.stack([d[g[0]] if len(g) == 1 else d[g].sum(axis=0) for g in groups])
@@ -451,7 +452,7 @@ def upsample_forward(x):
               align_corners=False)
     Args      x : (C, T, B)
     Returns   y : (C, 2 T, B); cache
-    Test      tests/skeletal/test_skeletal.py::test_upsample_gradients, test_upsample_matches_torch
+    Test      tests/skeletal/test_skeletal.py::test_upsample, test_upsample_matches_torch
     """
     y = np.empty((x.shape[0], 2 * x.shape[1], x.shape[2]), x.dtype)
     y[:, 0::2], y[:, 1::2] = 0.75 * x, 0.75 * x
@@ -463,7 +464,7 @@ def upsample_forward(x):
 
 
 def upsample_backward(dy, cache=None):
-    """Gradient of `upsample_forward`.  Test: tests/skeletal/test_skeletal.py::test_upsample_gradients"""
+    """Gradient of `upsample_forward`.  Test: tests/test_gradients.py::test_backward"""
     dx = 0.75 * (dy[:, 0::2] + dy[:, 1::2])
     dx[:, :-1] += 0.25 * dy[:, 2::2]
     dx[:, 0] += 0.25 * dy[:, 0]
@@ -473,7 +474,7 @@ def upsample_backward(dy, cache=None):
 
 
 def leaky_forward(x):
-    """max(x, 0.2 x).  Test: tests/skeletal/test_skeletal.py::test_leaky_gradients"""
+    """max(x, 0.2 x).  Test: tests/skeletal/test_skeletal.py::test_leaky"""
     y = x * x.dtype.type(SLOPE)
     np.maximum(x, y, out=y)
     return y, y
@@ -482,7 +483,7 @@ def leaky_forward(x):
 def leaky_backward(dy, cache):
     """Gradient of `leaky_forward`, by the sign of its output.
 
-    Test      tests/skeletal/test_skeletal.py::test_leaky_gradients"""
+    Test      tests/test_gradients.py::test_backward"""
     dx = np.maximum(cache > 0, cache.dtype.type(SLOPE))
     dx *= dy
     return dx, ()
@@ -494,7 +495,7 @@ def batch_norm_forward(x, weights):
 
     Equation  y = gamma (x - mean) / sqrt(var + eps) + beta
     Args      x : (C, T, B); weights : (gamma, beta), (C,) each
-    Test      tests/skeletal/test_skeletal.py::test_batch_norm_gradients
+    Test      tests/skeletal/test_skeletal.py::test_batch_norm
     """
     gamma, beta = weights
     mean = x.mean(axis=(1, 2), keepdims=True)
@@ -506,7 +507,7 @@ def batch_norm_forward(x, weights):
 def batch_norm_backward(dy, cache):
     """Gradient of `batch_norm_forward`; grads (dgamma, dbeta).
 
-    Test      tests/skeletal/test_skeletal.py::test_batch_norm_gradients
+    Test      tests/test_gradients.py::test_backward
     """
     n, inv, gamma = cache
     dgamma, dbeta = (dy * n).sum(axis=(1, 2)), dy.sum(axis=(1, 2))
@@ -561,7 +562,7 @@ def fk_forward(x, offsets, parents, turn):
     Returns   bones : (J, 3, T, B), p_j - p_parent, and in row 0 the root's velocity and height: what the critic sees
               world : (J, 3, T, B); cache
     Raises    ValueError: a quaternion of zero length
-    Test      tests/skeletal/test_skeletal.py::test_fk_against_scipy, test_fk_gradients
+    Test      tests/skeletal/test_skeletal.py::test_fk_against_scipy, tests/test_gradients.py::test_backward
     """
     J, (_, T, B) = len(parents), x.shape
     q = np.concatenate([x[None, 3:ROOT], x[ROOT:].reshape(J - 1, 4, T, B)])
@@ -592,7 +593,7 @@ def fk_forward(x, offsets, parents, turn):
 def fk_backward(dbones, dworld, cache):
     """Gradient of `fk_forward` for x; either of the two may be None.
 
-    Test      tests/skeletal/test_skeletal.py::test_fk_gradients
+    Test      tests/test_gradients.py::test_backward
     """
     u, length, M, G, offsets, parents, c, s = cache
     J, _, T, B = u.shape

@@ -47,7 +47,7 @@ GAIN = math.sqrt(2.0 / (1.0 + SLOPE**2))  # He 2015
 class Network:
     """Parameters of several layers in one flat vector, and their gradient in another of the same layout.
 
-    Test: tests/skeletal/test_skeletal.py::test_encoder_decoder_gradients"""
+    Test: tests/test_gradients.py::test_backward"""
 
     def __init__(self, rng, dtype=np.float32):
         self.rng, self.dtype, self._shapes = rng, dtype, []
@@ -148,7 +148,7 @@ class Generator(Network):
               their latents start in agreement; the paper's start at random
     Args      parents : of the structure; choices : Choices; pool : "mean" or "max"; plain : True makes one armature of
               all (full convolutions, no skeletal pooling): Holden's, for §4.4's comparison, with as many channels
-    Test      tests/skeletal/test_skeletal.py::test_encoder_decoder_gradients, test_plain_is_full
+    Test      tests/test_gradients.py::test_backward, tests/skeletal/test_skeletal.py::test_plain_is_full
     """
 
     def __init__(
@@ -269,7 +269,7 @@ class Critic(Network):
     Layers    convolution (stride 2), pool, LeakyReLU; convolution (stride 2), batch norm, pool, LeakyReLU; a
               convolution to one score an armature and four frames (its patches)
     Departs   the published code's bone vectors stand in the world; ours in the heading frame: no compass
-    Test      tests/skeletal/test_skeletal.py::test_critic_gradients
+    Test      tests/skeletal/test_skeletal.py::test_critic_scores_patches, tests/test_gradients.py::test_backward
     """
 
     def __init__(self, parents, rng, choices=CHOICES["ours"], channels=CHANNELS, dtype=np.float32):
@@ -330,7 +330,7 @@ def carry_root(y, raw, mean, std):
 
 
 def mse(a, b):
-    """Mean square of a - b and its gradient for a.  Test: tests/skeletal/test_skeletal.py::test_losses"""
+    """Mean square of a - b and its gradient for a.  Test: tests/test_gradients.py::test_backward"""
     d = a - b
     return float(np.mean(d * d, dtype=np.float64)), d * (2.0 / d.size)
 
@@ -370,7 +370,7 @@ def lsgan(score, real):
     r"""Least squares GAN  [SAN-6]: (C - 1)^2 for what is or should pass as real, C^2 for fakes, as a mean.
 
     Returns   loss; d score
-    Test      tests/skeletal/test_skeletal.py::test_losses
+    Test      tests/skeletal/test_skeletal.py::test_losses, tests/test_gradients.py::test_backward
     """
     return mse(score, score.dtype.type(real))
 

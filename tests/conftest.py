@@ -30,13 +30,24 @@ def mocap_dir():
     return Path(name)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session", autouse=True)
 def motions_once():
-    """The built-in motions are made once a module, not for every run."""
+    """The built-in motions are made once, not for every run of every module; who writes into them fails."""
     from mocap import data
 
+    original, made = data.builtin_clips, {}
+
+    @functools.wraps(original)
+    def once(rate=data.CONTROL_RATE, seed=0, name="builtin"):
+        if (rate, seed, name) not in made:
+            made[rate, seed, name] = original(rate, seed, name)
+            for clip in made[rate, seed, name]:
+                for array in (clip.pos, clip.quat, clip.ball):
+                    array.flags.writeable = False
+        return list(made[rate, seed, name])
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(data, "builtin_clips", functools.cache(data.builtin_clips))
+        patch.setattr(data, "builtin_clips", once)
         yield
 
 
