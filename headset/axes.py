@@ -40,6 +40,7 @@ HANGS = 0.1  # m, horizontally from the face to a hanging hand, either way
 WALKS = 0.4  # m/s of a headset: it is carried somewhere
 SWAPPED = 0.8  # what the fit of another order of devices must gain over the one told.  ASSUMED
 SURE = 0.6  # by how much a fit must be better to be said.  ASSUMED
+OTHER_GRIP = 0.3  # what it costs that a controller is not held as these axes' own are.  ASSUMED
 GRIP_OFF = 45.0  # degrees from a forearm to where the grip says that the fingers are
 
 
@@ -106,7 +107,8 @@ def fit(t, pos, quat, axes, order=(0, 1, 2), unit: float | None = 1.0) -> Fit:
     Cues      head upright; headset at 0.5 to 2.3 m, or, with a floor of its own, at ±0.5 m; hands below it by 0.3 m
               and before rather than behind the face; left one left of the right one by 0.3 m, and not both to one side;
               the headset carried forwards, a metre or more;
-              the forearm's lever between forward and 90 degrees below it, twice.  A controller that lies is no hand
+              the forearm's lever between forward and 90 degrees below it, twice, and where these axes' grip has it.  A
+              controller that lies is no hand
     Why       each is cut to -1 … 1, so that none outvotes the others: somebody bends over, somebody holds both hands
               on one side
     Args      t (T,); pos (T, 3, 3), quat (T, 3, 4) x, y, z, w, as they came
@@ -143,6 +145,8 @@ def fit(t, pos, quat, axes, order=(0, 1, 2), unit: float | None = 1.0) -> Fit:
         score += 2.0 * share / len(held) * cut(1.0 - off / 30.0 - (abs(r[1]) / long) ** 2)
         angles, weights = [*angles, angle], [*weights, share]
     forearm = float(np.average(angles, weights=weights)) if angles else None
+    if forearm is not None and abs(forearm - GRIP[axes]) > GRIP_OFF:
+        score -= OTHER_GRIP
     return Fit(axes, tuple(order), unit, score, forearm)
 
 
