@@ -25,7 +25,7 @@ from mocap.data import CONTROL_RATE
 from nn import LEAKY_SLOPE
 from plumbing.cli import UserError, arg, cli, run_main
 from plumbing.files import atomic_write, check_folders
-from policy import Policy, devices_of, find_policy, load_character
+from policy import Policy, devices_of, find_policy, load_character, total_steps
 
 OPSET, IR = 17, 8  # of 2022: what Unity's and Unreal's importers read
 UNITS = {
@@ -137,7 +137,8 @@ def main(argv=None) -> None:
     char = load_character(opt, meta, path)
     out = Path(opt.out or f"{char.name}.onnx")
     check_folders(out, read=(opt.policy,))
-    notes = {"licence": str(meta.get("licence", "not said")), "policy": Path(path).name, "steps": str(meta["steps"])}
+    notes = {"licence": str(meta.get("licence", "not said")), "policy": Path(path).name}
+    notes["steps"] = str(total_steps(meta))
     model = model_of(policy, char, devices_of(meta, path, None), notes)
     atomic_write(out, model.SerializeToString())
     sizes = ", ".join(f"{i.name} {i.type.tensor_type.shape.dim[1].dim_value}" for i in model.graph.input)
