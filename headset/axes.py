@@ -29,7 +29,7 @@ from plumbing.cli import UserError
 
 SECONDS = (1.0, 11.0)  # of headset: when a stream is judged, and again
 LONG = 60.0  # s of a file in whose first eleven both controllers lie still
-SEEN = 60.0  # Hz, at most as many readings are looked at
+SEEN = 30.0  # Hz, at most as many readings are looked at
 NAMES = ("unity", "openxr", "mujoco", "unreal")  # openvr has the axes of openxr, and its own grip
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
 REACH = (0.25, 1.4)  # m from headset to controller, in the median.  ASSUMED; recorded: 0.45 to 0.95
@@ -39,6 +39,7 @@ LIES = 0.01  # m of standard deviation: a controller that moves less is in nobod
 HANGS = 0.1  # m, horizontally from the face to a hanging hand, either way
 WALKS = 0.4  # m/s of a headset: it is carried somewhere
 SWAPPED = 0.8  # what the fit of another order of devices must gain over the one told.  ASSUMED
+PERSON = 4.0  # of at most 8: what reads like a person.  Recorded: 4.5 to 6.3, 3.1 with controllers on a table
 SURE = 0.6  # by how much a fit must be better to be said.  ASSUMED
 OTHER_GRIP = 0.3  # what it costs that a controller is not held as these axes' own are.  ASSUMED
 GRIP_OFF = 45.0  # degrees from a forearm to where the grip says that the fingers are
@@ -73,7 +74,7 @@ class Choice(NamedTuple):
 
 
 def tracked(samples, devices=3) -> list[Sample]:
-    """Samples in which every device has a pose, at most 60 a second.  Test: tests/headset/test_axes.py::test_few"""
+    """Samples in which every device has a pose, at most 30 a second.  Test: tests/headset/test_axes.py::test_few"""
     out = []
     for s in samples:
         rows = np.concatenate([s.pos, s.quat], axis=1)[:devices]
@@ -101,7 +102,15 @@ def lever(t, pos, quat, lag=LAG):
     return r, max(0.0, 1.0 - float(np.sum((b - a @ r) ** 2) / np.sum(b**2)))
 
 
-def fit(t, pos, quat, axes, order=(0, 1, 2), unit: float | None = 1.0) -> Fit:
+def levers(t, pos, quat) -> dict:
+    """(headset, hand) -> `lever` of the hand seen from the headset, in the file's axes, for every pair of devices.
+
+    Test      tests/headset/test_axes.py::test_lever"""
+    own = np.roll(quat, 1, axis=-1)
+    return {(h, k): lever(t, pos[:, k] - pos[:, h], own[:, k]) for h, k in permutations(range(3), 2)}
+
+
+def fit(t, pos, quat, swings, axes, order=(0, 1, 2), unit: float | None = 1.0) -> Fit:
     r"""How well axes, an order of the devices and a unit fit a person.
 
     Cues      head upright; headset at 0.5 to 2.3 m, or, with a floor of its own, at ±0.5 m; hands below it by 0.3 m
@@ -111,7 +120,7 @@ def fit(t, pos, quat, axes, order=(0, 1, 2), unit: float | None = 1.0) -> Fit:
               controller that lies is no hand
     Why       each is cut to -1 … 1, so that none outvotes the others: somebody bends over, somebody holds both hands
               on one side
-    Args      t (T,); pos (T, 3, 3), quat (T, 3, 4) x, y, z, w, as they came
+    Args      t (T,); pos (T, 3, 3), quat (T, 3, 4) x, y, z, w, as they came; swings : `levers` of them
     Test      tests/headset/test_axes.py::test_wrong_axes, ::test_recorded
     """
     p, q = to_world(pos[:, list(order)], quat[:, list(order)], axes, 90.0, unit or 1.0)
@@ -136,7 +145,8 @@ def fit(t, pos, quat, axes, order=(0, 1, 2), unit: float | None = 1.0) -> Fit:
     score += cut(np.sum(step[goes] * ahead[:-1][goes]))
     angles, weights = [], []
     for k in held:
-        r, share = lever(t, p[:, 1 + k] - p[:, 0], q[:, 1 + k])
+        r, share = swings[order[0], order[1 + k]]
+        r = AXES[axes] @ r * (unit or 1.0)
         long = np.linalg.norm(r)
         if share < 0.2 or not 0.05 < long < 1.0:
             continue
@@ -161,8 +171,12 @@ def fits(samples, devices=3) -> list[Fit]:
     if not np.isfinite(t).all() or t[-1] - t[0] < 0.5 * SECONDS[0]:
         t = np.arange(len(t)) / 90.0
     unit = unit_of(pos)
-    orders = [o for o in permutations(range(3)) if unit or o == (0, 1, 2)]
-    found = [fit(t, pos, quat, axes, order, unit) for axes in NAMES for order in orders]
+    swings = levers(t, pos, quat)
+    orders = list(permutations(range(3))) if unit else [(0, 1, 2)]
+    found = []
+    for some in (orders[:2], orders[2:]):  # the headset first; elsewhere only if nobody wears it there
+        if not found or max(f.score for f in found) < PERSON:
+            found += [fit(t, pos, quat, swings, axes, order, unit) for axes in NAMES for order in some]
     return sorted(found, key=lambda f: SWAPPED * (f.order != (0, 1, 2)) - f.score)
 
 
@@ -188,7 +202,9 @@ def judge(samples, axes="unity", grip=None, unit=None, order=(0, 1, 2), devices=
         return []
     best, lines = found[0], []
     alike = [f for f in found if np.array_equal(AXES[f.axes], AXES[axes])]
-    told = next((f for f in alike if f.order == tuple(order)), alike[0])
+    told = next((f for f in alike if f.order == tuple(order)), None)
+    if told is None:
+        return [f"the devices fit a person in another order: --devices {','.join(DEVICES[k] for k in best.order)}"]
     used = UNIT.get(axes, 1.0) if unit is None else unit
     if best.unit not in (None, used):
         name = next(n for n, u in UNITS.items() if u == best.unit)

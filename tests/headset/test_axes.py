@@ -2,6 +2,7 @@
 
 import csv
 import functools
+import time
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from test_stream import sensors_dir, to_csv  # noqa: F401, a fixture
 from headset import axes
 from headset.axes import NAMES, beginning, choose, fits, guess, judge, lever, tracked, unit_of
 from headset.reader import AXES, UNIT, Reader, Sample, to_world
-from human import linear_velocity, quat_about, quat_mul, quat_rotate, sensors
+from human import quat_about, quat_mul, quat_rotate, sensors
 from plumbing.cli import UserError
 
 POINTING = quat_about(1, np.radians(75.0))  # from the hand's frame to that of what it points with
@@ -65,6 +66,9 @@ def test_lever():
     r, share = lever(t, pos, quat)
     np.testing.assert_allclose(r, rod, atol=0.02)
     assert share > 0.95
+    all_three = np.stack([0 * pos, pos, pos], axis=1), np.stack([np.roll(quat, -1, axis=-1)] * 3, axis=1)
+    for pair in ((0, 1), (0, 2)):
+        np.testing.assert_allclose(axes.levers(t, *all_three)[pair][0], r)
     assert lever(t, np.zeros((300, 3)), quat)[1] == 0 and lever(t[:3], pos[:3], quat[:3])[1] == 0
 
 
@@ -224,12 +228,10 @@ def test_first_second(sensors_dir):  # noqa: F811
 
 def test_speed():
     """Eleven seconds are judged in a fraction of one: a live stream must not stutter."""
-    import time
-
     samples = in_axes() * 2
-    start = time.perf_counter()
+    start = time.process_time()
     judge(samples)
-    assert time.perf_counter() - start < 0.5 and linear_velocity(np.zeros((3, 1)), 1.0).shape == (3, 1)
+    assert time.process_time() - start < 0.5
 
 
 def test_reader_reads_all_axes():
