@@ -539,7 +539,8 @@ def look(char: Character, policy, path, meta, opt: Options) -> None:
     clips = mocap.data.sequences(opt.motion, split, opt.clips, seed=opt.seed, reading=Reading.of(opt))
     if opt.sequence >= len(clips):
         raise UserError(f"--sequence {opt.sequence}: there are {len(clips)}, from 0")
-    ref = retarget.reference(char, [resize(clips[opt.sequence], opt.user_scale)])
+    clip = clips[opt.sequence]
+    ref = retarget.reference(char, [clip if opt.user_scale == 1.0 else resize(clip, opt.user_scale)])
     seen, push = metrics.shown_to(meta, path, ref, opt.sensors), parse_push(opt.push)
     check_fits(policy, Env(char, seen, 1), path)
     if opt.png or opt.video or opt.bvh:

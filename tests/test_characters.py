@@ -444,12 +444,12 @@ def test_set(chars):
         ("training.sigma=0", r"\[training\] sigma = 0 must be greater than 0"),
         ("training.lr='fast'", r"\[training\] lr = 'fast' is not a finite number"),
         ("training.hidden=[8, 0]", r"\[training\] hidden = 0 must be greater than 0"),
-        ("training.hidden=[8.5]", r"\[training\] hidden = \[8.5\] must be integers"),
-        ("training.horizon=3.5", r"\[training\] horizon = 3.5 is not an integer"),
-        ("training.balance=1", r"\[training\] balance = 1 is not true or false"),
+        ("training.hidden=[8.5]", r"\[training\] hidden = 8.5 must be a whole number"),
+        ("training.horizon=3.5", r"\[training\] horizon = 3.5 must be a whole number"),
+        ("training.balance=1", r"\[training\] balance = 1 must be true or false"),
         ("training.retry=2", r"\[training\] retry = 2 must be from 0 to 1"),
-        ("training.by='os'", r"\[training\] by = 'os' must be the name of a module in extras"),
-        ("training.speed=1", r"\[training\] has 'speed', which means nothing; valid: by, lr, .*hidden"),
+        ("training.by='os'", r"\[training\] by = 'os' must be a module of ours"),
+        ("training.speed=1", r"\[training\] has 'speed', which means nothing; valid: hidden, .*by"),
     ):
         with pytest.raises(UserError, match=says) as error:
             character.load("jesse", set=[change])

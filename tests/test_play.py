@@ -184,14 +184,14 @@ def test_time_to_failure(char, long):
     found = metrics.time_to_failure(char, long, metrics.zero_action, n=6, seconds=3.0, seed=4, threads=1)
     env = Env(char, long, 6, threads=1, autoreset=False)
     draw = np.random.default_rng(4)  # the starts that the environment draws, replayed by hand
-    env.reset(frames=draw.choice(env.starts, 6))
+    env.reset(frames=env.starts.draw(draw, 6)[0])
     failures = 0
     for _ in range(90):
         _, _, terminated, truncated, _ = env.step(np.zeros((6, env.action_size)))
         failures += terminated.sum()
         done = np.flatnonzero(terminated | truncated)
         if len(done):
-            env._reset(done, draw.choice(env.starts, len(done)))
+            env._reset(done, env.starts.draw(draw, len(done))[0])
     assert failures >= 3 and found == pytest.approx(6 * 3.0 / failures)
 
 

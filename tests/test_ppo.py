@@ -698,7 +698,7 @@ def test_recipe(tmp_path, monkeypatch):
     assert changed.sigma == 0.2 and changed.horizon == 4
     plain = recipe_options("--character", ours, "--recipe", "none")
     assert replace(plain, character="jesse", recipe="character") == Options(out="runs/own")
-    with pytest.raises(UserError, match=r'jesse.toml: \[training\] augment, balance, .*retry, .*by = "extras.train"'):
+    with pytest.raises(UserError, match=r'jesse.toml: \[training\] balance, .*retry, .*by = "extras.train"'):
         recipe_options("--character", "jesse")
     with pytest.raises(SystemExit):
         recipe_options("--recipe", "mine")
