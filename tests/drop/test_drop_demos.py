@@ -301,6 +301,34 @@ def test_follower_keeps_the_speed(stage, speed, led):
         assert numbers(take.notes["hand to the place it is led to"])[0] < 60
 
 
+class Caught(Exception):
+    """Carries what a demonstration was about to simulate."""
+
+
+@pytest.mark.parametrize("speed", [1.2, 2.5])
+def test_follower_waits_and_hurries(stage, monkeypatch, speed):
+    """v_tar leads to where the dot is in 0.6 s, so a follower near it slows down; far behind, at most 1.25 times the
+    dot's speed."""
+
+    def caught(name, sim, state, frames, rng, act):
+        raise Caught(state, act)
+
+    monkeypatch.setattr(demos, "single", caught)
+    for behind in (0.0, 0.2, 1.0, 1.2, 2.0, 9.0):  # of the distance that the dot is ahead at its own speed
+        with pytest.raises(Caught) as found:
+            demos._follow(stage, np.random.default_rng(0), speed, False)
+        state, act = found.value.args
+        yaw = heading(state.quat[0])
+        ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+        way = 0.6 * speed * (1.0 - behind) + speed * STEP  # so much nearer to the dot, which has moved
+        _, more, ((dot, *_),) = act(0, State(state.x + way * ahead, state.v, state.quat))
+        gap = dot[:2] - (state.com + way * ahead)[:2]
+        np.testing.assert_allclose(gap, 0.6 * speed * behind * ahead[:2], atol=1e-9)
+        wanted = gap / 0.6
+        wanted *= min(1.0, 1.25 * speed / max(np.linalg.norm(wanted), 1e-9))
+        np.testing.assert_allclose(more["v_tar"], wanted, atol=1e-9)
+
+
 def drop_turn(a, b):
     d = heading(a) - heading(b)
     return np.degrees((d + np.pi) % (2 * np.pi) - np.pi)

@@ -61,6 +61,24 @@ def test_ensemble(stage):
     assert np.isfinite(bare[:, :, 2:]).all()
 
 
+def test_the_bare_figure_has_neither_contact_nor_limits(stage, monkeypatch, capsys):
+    """Fig. 5 is the same ensemble without contact and range of motion, both measured by the whole one's rule."""
+    made = []
+
+    class Seen(figures.Watched):
+        def __init__(self, *args, **settings):
+            super().__init__(*args, **settings)
+            made.append(self)
+
+    monkeypatch.setattr(figures, "Watched", Seen)
+    monkeypatch.setattr(demos, "Stage", lambda opt: stage)
+    figures.energies(figures.Options(count=1, frames=2))
+    full, bare = made
+    assert full.contact and full.limits is stage.limits is not None
+    assert not bare.contact and bare.limits is None
+    assert full.measure is bare.measure is stage.limits
+
+
 def test_claims():
     """From medians whose ratios are known; a median over motions leaves out those without a prior."""
     full = np.tile([7.0, 10.0, 1, 1, 1, 1], (160, 1))

@@ -2,6 +2,7 @@
 
 import json
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -246,6 +247,24 @@ def test_measure_command(trained, tmp_path, monkeypatch, capsys):
     assert r["copy_cross"] == min(v["cross"] for v in r["rows"]["copies"].values()) > 0
     assert r["cross"] > 10 * r["copy_cross"]  # two steps do not teach anything
     assert r["slide_clean"] < r["slide"] and "copy (names" in capsys.readouterr().out
+
+
+def test_contacts_are_the_sources(trained, tmp_path, monkeypatch, capsys):
+    """Feet that stand in the source must stand in the result, which cannot excuse itself by sliding all the time."""
+    m = data.human_motion(CLIPS[0])
+    way = np.outer(np.arange(len(m)) / data.RATE, [2.0, 0.0, 0.0])  # 2 m/s: no foot of it stands
+    skating = lambda net, m, *_: replace(m, pos=m.pos + way)  # noqa: E731
+    monkeypatch.setattr(play.Retargeter, "__call__", skating)
+    net, standing = play.Retargeter(trained / "run"), data.contacts(m)
+    assert standing.any() and not data.contacts(net(m)).any()
+    row = play.errors([("intra", 0, m, 0, m)], net)
+    assert row["slide"] == pytest.approx(100 * data.sliding(net(m), standing)) and row["slide"] > 150
+    assert row["slide_clean"] < 0.9 * row["slide"] and row["slide_true"] < 50
+    data.write_motion(tmp_path / "a.bvh", m, net.domains[0].structure)
+    files = ("--source", tmp_path / "a.bvh", "--target", tmp_path / "a.bvh", "--out", tmp_path / "b.bvh", "--up", "z")
+    assert run("retarget", "--weights", trained / "run", *files) == 0
+    before, after = capsys.readouterr().out.partition("feet slide ")[2].split(" cm/s, after the clean-up ")
+    assert float(before) > 150 and float(after.partition(";")[0]) < 0.9 * float(before)
 
 
 def test_shifted_copy(trained):

@@ -136,6 +136,38 @@ def test_critics_tell_fakes():
     assert C.forward(real, s)[0].mean() > C.forward(fake, s)[0].mean() + 0.1
 
 
+def test_critics_see_the_pools_fakes():
+    """[SAN-6] What each critic is shown as fake is what its own pool gives for the new ones, which the pool keeps."""
+    tr, shown = small_trainer(intra=0.0), []
+    judge, exchange = tr._critic_step, [pool.exchange for pool in tr.pools]
+    for n, pool in enumerate(tr.pools):
+        pool.exchange = lambda bones, s, rng, n=n: (exchange[n](bones, s, rng)[0] + 100.0 * (n + 1), s)
+    tr._critic_step = lambda C, real, fake: (shown.append((C, real[0], fake[0])), judge(C, real, fake))[1]
+    for step in range(1, 3):
+        tr.step()
+        assert [len(pool.bones) for pool in tr.pools] == [2 * step] * 2
+    assert [C for C, *_ in shown] == [*tr.critics] * 2
+    for k, (_, real, fake) in enumerate(shown):
+        away = 100.0 * (k % 2 + 1)
+        assert np.abs(fake - away).max() < 20 and np.abs(real).max() < 20  # shown by way of the pool; the real ones not
+
+
+def test_targets_are_all_of_the_targets_structure():
+    """Every character of the structure that is retargeted to, across and within, is a target as often as any other."""
+    tr = small_trainer(batch=8, without="adv", intra=0.3)
+    cast = tr.domains[1].characters
+    cast += [cast[0]] * 3  # two here, five there
+    drawn = {}
+    tr.direction = lambda m, n, batch, targets: (drawn.setdefault((m, n), []).extend(targets), ({}, None, None))[1]
+    for _ in range(60):
+        tr.step()
+    assert set(drawn) == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    for (_, n), targets in drawn.items():
+        share = np.bincount(targets, minlength=len(tr.domains[n].characters)) / len(targets)
+        np.testing.assert_allclose(share, 1 / len(tr.domains[n].characters), atol=0.15)
+    assert 0.1 < len(drawn[0, 0]) / (60 * 8) < 0.5  # `intra`
+
+
 def test_root_is_carried():
     """The fake's root moves and stands as the source's, in legs, whatever the decoder says; decoded, it does not."""
     x, turn, who = small_trainer().domains[0].sample(np.random.default_rng(1), 2)
