@@ -51,7 +51,7 @@ class HeadingFrame:
     r"""The frame of every observation: on the floor below the root, turned with the root's heading  [Reda23 §3.3].
 
     Equation  p' = R_z(−ψ) (p − (x_root, y_root, 0)),  R' = R_z(−ψ) R
-    Symbols   ψ = `mocap.heading`, of the body's left axis: does not flip when it bends over
+    Symbols   ψ = `human.heading`, of the body's left axis: does not flip when it bends over
     Args      root_pos (N, 3) [m], root_quat (N, 4) w, x, y, z, world
     Test      tests/test_env.py::test_heading_invariance, test_observation_terms
     """

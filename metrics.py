@@ -221,7 +221,7 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
     Joints are the bodies of the joint map; for positions and jitter the hands too.  The human's own figures are taken
     before the scaling.  Contact and action are measured after steps, so not at the start.
     Returns   key -> number; NaN where there was nothing to measure (no frame, no step, no metre travelled);
-              "spring_share.GROUP" for every group of driven joints
+              "spring_share.GROUP" of every group of driven joints: RMS(springs) / (RMS(springs) + RMS(motors)).  ASSUMED
     Test      tests/test_metrics.py::test_metrics_against_slow_loop, test_metrics_of_kinematic,
               test_metrics_on_known_motion, test_nothing_to_measure
     """
@@ -335,7 +335,7 @@ def _markdown(rows, results) -> str:
 
 def cells(name, row) -> list[str]:
     """A row's numbers as text, in the order of COLUMNS."""
-    kinematic = ("completed", "survival", "fails_every_s", "torque_rms", "saturation")
+    kinematic = ("completed", "survival", "fails_every_s", "torque_rms", "saturation", "spring_share")
     dash = kinematic if name.startswith("kinematic") else ()
     return ["-" if k in dash else cell(row.get(k, np.nan), fmt) for k, _, fmt in COLUMNS]
 
@@ -699,6 +699,8 @@ def run(opt: Options) -> None:
     else:
         hang = opt.sensors == "hmd" and devices == 3  # no stream shows controllers that hang
         results = measure_all(char, ref, policy, opt, seen, () if hang else captures, devices)
+        if not results:
+            raise UserError("--rows streamed: there is none with controllers that hang; leave out --sensors hmd")
         print(table(results))
         text = as_json(results)
     if opt.json:
@@ -759,7 +761,7 @@ def compare(arms: list[Arm], opt: Options, captures=()) -> dict:
     Test      tests/test_play.py::test_compare"""
     out = {}
     for a in arms:
-        if "streamed" in opt.rows and captures and a.devices == a.seen.sensor_pos.shape[1]:
+        if "streamed" in opt.rows and captures and not (opt.sensors == "hmd" and a.devices == 3):
             out[f"{a.path} streamed"] = streamed(a.char, a.policy.mean_action, captures, a.devices, opt.threads)
         if "tracked" in opt.rows:
             out[a.path] = measure_one(a.path, a.char, a.ref, policy_action(a.policy), opt, a.seen)

@@ -48,7 +48,7 @@ from retarget import Reference, forward_kinematics
 
 # flags that say something of a motion alone, or of a stream alone
 OF_MOTION = {"motion", "clips", "joint_map", "unit", "up", "all", "split", "half", "rows", "user_scale"}
-OF_MOTION |= {"random_starts", "sequence"}
+OF_MOTION |= {"random_starts", "sequence", "rate", "floor", "rest_pose"}
 OF_STREAM = {"axes", "grip", "stream_unit", "devices", "sample_rate", "user_height", "realtime"}
 
 
@@ -427,10 +427,10 @@ def play_recordings(char: Character, policy, path, devices: int, opt: Options) -
     A file that is no recording is named in a line and left out.  -> exit status, 1 if there was one
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
     check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
-    streams, broken = {}, []
+    streams, broken, read = {}, [], 1 if opt.sensors == "hmd" else devices
     for file in recordings_of(opt.stream):
         try:
-            streams[file] = ticks_of(char, file, devices, opt)
+            streams[file] = ticks_of(char, file, read, opt)
         except UserError as error:
             broken.append(str(error))
     if not streams:
@@ -438,8 +438,8 @@ def play_recordings(char: Character, policy, path, devices: int, opt: Options) -
     rides = ride(char, policy.mean_action, list(streams.values()), devices, opt.threads)
     top = Path(opt.stream)
     names = [str(f.relative_to(top)) if top.is_dir() else f.name for f in streams]
-    found = {"files": {n: summary_of(char, [r], devices) for n, r in zip(names, rides)}}
-    found["all"] = summary_of(char, rides, devices) | {"completed": float(np.mean([r.failures == 0 for r in rides]))}
+    found = {"files": {n: summary_of(char, [r], read) for n, r in zip(names, rides)}}
+    found["all"] = summary_of(char, rides, read) | {"completed": float(np.mean([r.failures == 0 for r in rides]))}
     for name, ends, row in zip(names, [r.ends for r in rides], found["files"].values()):
         print(line_of(name, ends, row))
     ends = sum((r.ends for r in rides), Counter())
@@ -487,6 +487,8 @@ def check_options(opt: Options, argv) -> None:
     many = opt.stream and Path(opt.stream).is_dir()
     if many and (opt.png or opt.video or opt.view or opt.realtime or opt.push):
         raise UserError(f"--stream {opt.stream}: is a folder, played side by side: leave out pictures, --view, --push")
+    if opt.stream and opt.json and (opt.realtime or opt.push):
+        raise UserError("--stream with --json plays as it is: leave out --push and --realtime")
     if opt.stream and opt.json and not many and is_live(opt.stream):
         raise UserError("--json tells of recordings, not of a live stream; valid: a .csv file or a folder of them")
     parse_push(opt.push)

@@ -38,8 +38,8 @@ from human import (
     sensors,
 )
 from mocap.bvh import BvhError, write
-from mocap.data import MOTION, load
-from mocap.rigs import HELP, Reading
+from mocap.data import MotionFlags, load
+from mocap.rigs import Reading
 from plumbing.cli import UserError, arg, cli, run_main
 from plumbing.files import check_folders
 
@@ -439,14 +439,9 @@ def write_bvh(path, char: Character, qpos, rate) -> None:
 
 
 @dataclass
-class Options(character.Switches):
+class Options(MotionFlags, character.Switches):
     """What `python retarget.py` can be told."""
 
-    motion: str = arg("builtin", MOTION)
-    clips: str = arg("*", "shell pattern on clip names")
-    joint_map: str | None = arg(None, HELP["joint_map"])
-    unit: str | None = arg(None, HELP["unit"])
-    up: str | None = arg(None, HELP["up"])
     png: str | None = arg(None, "write a contact sheet of the first clip, human and character side by side")
     camera: str = arg("track", "camera of the pictures: track, side, front, or another of the model's")
     video: str | None = arg(None, "write a video of the first clip (.mp4; needs the extra `view`)")

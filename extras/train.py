@@ -122,7 +122,7 @@ class Curriculum(Uniform):
     def balanced(self, rng, n):
         """Frames (n,): sequences by how often they are wanted, frames within them evenly."""
         ref = self.ref
-        frames = ref.last - ref.first - 1  # that can be started from
+        frames = np.maximum(ref.last - ref.first - 1, 0)  # that can be started from
         h = np.maximum(self.failed / self.lived, 1e-6)
         p = frames * (1.0 + h / np.average(h, weights=frames)) * h / -np.expm1(-h * self.horizon)
         cdf = np.cumsum(p)
@@ -279,7 +279,7 @@ def key_of(opt: Options, char) -> str:
     Made of    the character's tables and model, the options that matter, name, size and time of every file, and CODE
     Test       tests/extras/test_train.py::test_cache
     """
-    m, names = char.model, ("motion", "clips", "joint_map", "unit", "up", "seed", "augment", "players")
+    m, names = char.model, [*(f.name for f in fields(data.MotionFlags)), "seed", "augment", "players"]
     asked = {name: getattr(opt, name) for name in names} | {"visits": opt.visits or opt.begin > 0}
     paths = [Path(p) for p in data.parts(opt.motion) if p not in data.BUILTIN]
     paths += [Path(p) for p in (opt.joint_map, opt.players) if p]

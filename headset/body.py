@@ -135,7 +135,7 @@ def plant_feet(pelvis, yaw, half, height, rate):
     at, facing, swing = place[0].copy(), np.array([yaw[0], yaw[0]]), None
     for t in range(n):
         if swing is None:
-            off = np.linalg.norm(place[t] - at, axis=1) / STEP_FAR + np.abs(yaw[t] - facing) / STEP_TURN
+            off = np.maximum(np.linalg.norm(place[t] - at, axis=1) / STEP_FAR, np.abs(yaw[t] - facing) / STEP_TURN)
             k = int(np.argmax(off))
             if off[k] > 1.0:
                 goal = min(t + steps, n - 1)

@@ -36,7 +36,7 @@ from retarget import HEADSET_AHEAD, STAGE_VEL, standing
 
 # ------------------------------------------------------------------------------------ the character
 
-AWAY = 1.0  # m, horizontally from the headset to the root: the character has lost the user
+AWAY = 1.0  # m, horizontally from the user's headset to HEADSET_AHEAD before the root: it has lost the user.  ASSUMED
 
 
 class Player:
@@ -84,6 +84,7 @@ class Player:
         for array in (self.qvel, self.ctrl, self.qacc_warmstart, self.xfrc_applied):
             array[ids] = 0.0
         self.qvel[ids, :2] = (pos[ids, 0] - self.before[0][ids, 0])[:, :2] / self.dt if self.before else 0.0
+        self.contact[ids] = False
         self.batch.forward(ids, STAGE_VEL)
 
     def step(self, pos, quat, playing=True) -> list[str | None]:

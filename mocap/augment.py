@@ -219,7 +219,7 @@ def lead(clip: Clip, still=1.5, rise=1.5, out=0.0) -> Clip:
     """
     rate, last = clip.rate, len(clip) - 1.0
     rise = min(rise, 2.0 * last / rate / (2 if out else 1))
-    n = round(rise * rate)
+    n = 2 * round(rise * rate / 2)  # even: the clip's own frames are played after it, none between two
     up = np.arange(1, n + 1) / max(n, 1)  # dτ/dt while it speeds up
     ramp = np.arange(1, n + 1) ** 2 / (2.0 * max(n, 1))  # frames
     begun = ramp[-1] if n else 0.0
@@ -233,7 +233,9 @@ def lead(clip: Clip, still=1.5, rise=1.5, out=0.0) -> Clip:
         [np.zeros(waits[0]), up, np.ones(len(middle)), np.linspace(1, 0, len(down) + 1)[1:], np.zeros(waits[1])]
     )
     height = float(sensors(clip[:1])[0][0, 0, 2])
-    return replace(planted(sampled(clip, frames), 1.0 - speed), measured=height, still=waits[0])
+    led = sampled(clip, frames)
+    led = planted(led, 1.0 - speed) if n else led  # who begins still stands on own feet already
+    return replace(led, measured=height, still=waits[0])
 
 
 def begins_in_motion(clip: Clip) -> bool:
@@ -248,8 +250,9 @@ def visits(clips: list[Clip], rng: np.random.Generator) -> list[Clip]:
     """Every clip twice, as it is and by another user (`augment`), with a lead-in and a lead-out of random lengths.
 
     ASSUMED   standing 0.6 to 1.6 s, speeding up in 0.8 to 1.6 s, standing 0.5 to 2.5 s at the end; longer clips in
-              parts of LONGEST s; the height that calibrates is that of the first pose in 70 % of the visits, otherwise
-              between it and the user's who stands straight, with a deviation of 1.2 %
+              parts of LONGEST s, a rest shorter than half left out; the height that calibrates is that of the first
+              pose in 70 % of the visits, otherwise between it and the user's who stands straight, with a deviation of
+              1.2 %
     Test      tests/mocap/test_mocap.py::test_visits
     """
     n, out = round(LONGEST * clips[0].rate) if clips else 0, []

@@ -1084,13 +1084,14 @@ def test_lead():
     pos, own = sensors(led)[0], sensors(clip)[0]
     assert led.still == 46 and led.measured == pytest.approx(own[0, 0, 2])
     np.testing.assert_allclose(pos[:46], np.tile(own[:1], (46, 1, 1)), atol=1e-9)
-    for k in range(1, 46):  # k / 30 s after it sets off: tau = t² / (2 · 1.5 s)
-        tau = (k / 30) ** 2 / 3.0 * 30
+    for k in range(1, 45):  # k / 30 s after it sets off: tau = t² / (2 · 44 / 30 s), an even number of frames
+        tau = k**2 / 88.0
         i = int(tau)
         np.testing.assert_allclose(pos[45 + k], own[i] + (tau - i) * (own[i + 1] - own[i]), atol=1e-4)
     speed = np.linalg.norm(np.diff(pos[:, 0], axis=0), axis=-1) * 30
     assert speed[45] < 0.1 and speed[100:].mean() > 0.8
-    assert len(led) == 46 + 45 + int(len(clip) - 1 - 22.5)
+    assert len(led) == 46 + 44 + len(clip) - 1 - 22
+    np.testing.assert_array_equal(pos[-60:], own[-60:])  # the clip's own frames, not between them
     both = augment.lead(clip, 1.0, 1.0, 1.0)
     np.testing.assert_allclose(sensors(both)[0][-30:], np.tile(own[-1:], (30, 1, 1)), atol=1e-9)
     assert contacts(both)[-20:].all() and contacts(both)[:20].all()  # who stands has both feet on the floor
