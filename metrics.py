@@ -1,6 +1,6 @@
 r"""Metrics: one definition each, for every table  [Reda23 §4; it prints none].
 
-    python metrics.py --character jesse --motion FOLDER [--split style] [--json OUT]     the table of spec/metrics
+    python metrics.py --character jesse --motion FOLDER [--split style] [--json OUT]     every metric
     python metrics.py --character jesse --motion FOLDER --push 400@2                     the largest push survived
     python metrics.py --compare A B … --motion FOLDER                                    policies beside one another
 
@@ -79,7 +79,7 @@ def jitter(x, rate):
 
 
 def footfalls(contact):
-    """How often a foot begins to touch, each beginning counted: spec/metrics.  contact (T, 2) bool -> int
+    """How often a foot begins to touch, each beginning counted: REPRODUCE.md's metrics.  contact (T, 2) bool -> int
 
     Test      tests/test_metrics.py::test_steps_contacts_and_torques"""
     return footfalls_apart(contact, 1.0, apart=0.0)
@@ -215,13 +215,14 @@ class _Pool:
 
 
 def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dict:
-    """Every metric of spec/metrics over recordings, pooled over their frames.
+    """Every metric of REPRODUCE.md's metrics over recordings, pooled over their frames.
 
     Frames lived count equally, whichever clip they are in; `completed` and `survival` say how many were lived.
     Joints are the bodies of the joint map; for positions and jitter the hands too.  The human's own figures are taken
     before the scaling.  Contact and action are measured after steps, so not at the start.
     Returns   key -> number; NaN where there was nothing to measure (no frame, no step, no metre travelled);
-              "spring_share.GROUP" of every group of driven joints: RMS(springs) / (RMS(springs) + RMS(motors)).  ASSUMED
+              "spring_share.GROUP" of every group of driven joints
+    ASSUMED   a share of springs is RMS(springs) / (RMS(springs) + RMS(motors))
     Test      tests/test_metrics.py::test_metrics_against_slow_loop, test_metrics_of_kinematic,
               test_metrics_on_known_motion, test_nothing_to_measure
     """
@@ -544,7 +545,7 @@ def time_to_failure(char, ref, act, n=256, seconds=20.0, seed=0, threads=0) -> f
 # ------------------------------------------------------------------------------------ as a user plays it
 
 def streamed(char: Character, act, clips, devices=3, threads=0) -> dict:
-    """The row `streamed` of spec/metrics: driven by sensors alone, from the default pose, with a lead-in.
+    """The row `streamed` of REPRODUCE.md's metrics: driven by sensors alone, from the default pose, with a lead-in.
 
     The errors are of all frames; after a failure the character stands up under the headset and goes on.
     Args      act : observations (n, o) -> actions (n, u); clips : captures, each as long as it is or CAPTURE

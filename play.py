@@ -5,7 +5,7 @@ r"""Watch one policy: picture, video, viewer, BVH; on a motion or a headset's re
     python play.py --character jesse --motion FOLDER --png OUT | --video OUT    headless pictures
     python play.py --character jesse --motion FOLDER --bvh OUT                  what the character did, as BVH
     python play.py --character jesse --motion FOLDER --view | --view web        MuJoCo's viewer: window or browser
-    python play.py --character jesse --motion FOLDER --measure [--json OUT]     the table of spec/metrics (metrics.py)
+    python play.py --character jesse --motion FOLDER --measure [--json OUT]     every metric (metrics.py)
     python play.py --character jesse --motion FOLDER --measure --push 400@2     the largest push survived
     python play.py --compare A B … --motion FOLDER [--json OUT] [--png OUT]     policies beside one another
 

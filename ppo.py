@@ -61,7 +61,7 @@ class Options(data.MotionFlags, character.Switches):
     envs: int = arg(512, "characters simulated side by side", check=COUNT)
     horizon: int = arg(16, "control steps of each character per update", check=COUNT)
     seed: int = arg(0, "seed of everything random", check=NONNEGATIVE)
-    out: str | None = arg(None, "run folder; runs/CHARACTER by default")
+    out: str | None = arg(None, "run folder, runs/CHARACTER by default; retargeted motion is kept beside it")
     resume: bool = arg(False, "continue the run in --out exactly")
     init: str | None = arg(None, "start from a policy (.npz) or a run folder of the same sizes")
     recipe: str = arg("character", "hyper-parameters: the character's, or none: the defaults", ("character", "none"))

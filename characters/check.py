@@ -130,6 +130,7 @@ def main(argv=None) -> int:
         return 1
     path = Path(argv[0])
     print(summary(character.load(path.with_suffix(".toml") if path.suffix == ".xml" else argv[0])))
+    print("nothing is wrong")
     return 0
 
 
