@@ -34,9 +34,9 @@ import retarget
 from character import Character
 from env import EPISODE_STEPS, Env
 from headset import axes, calibration
-from headset.player import Pace, Player, drive, ride
+from headset.player import Pace, Player, drive, ride, stream_of
 from headset.reader import AXES, DEVICES, GAP, SAMPLE_RATE, Reader, arriving, is_live, lines_of
-from human import heading
+from human import heading, sensors
 from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_action, simulate
 from mocap.augment import resize
 from mocap.data import CONTROL_RATE
@@ -98,28 +98,31 @@ PICTURES = 8  # a row of the figure, unless --every says otherwise
 def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320)):
     """One picture: the human beside the first character's kinematic pose, then a row for every policy.
 
-    All at the same moments of one sequence; where a policy had failed its row is empty.  The camera follows.
+    All at the same moments of one sequence; where a policy had failed its row is empty.  The camera follows.  Without
+    the row `tracked` the policies are streamed: driven by the sensors alone, from the default pose.
     Test      tests/test_play.py::test_comparison_sheet
     """
     from plumbing import render
 
     rate, first = arms[0].ref.rate, int(arms[0].ref.first[opt.sequence])
+    tracked = "tracked" in opt.rows
+    if not tracked:  # the human where the stream has them, lead-in and all
+        clip = stream_of(arms[0].char, clip)[2]
     last = min(len(clip) - 1, EPISODE_STEPS, round((opt.seconds or 10.0) * rate))
     step = max(1, round(opt.every * rate)) if opt.every else max(1, last / (PICTURES - 1))
     frames = np.unique(np.arange(0, last + 1, step).round().astype(int))
     times = [f"{t / rate:.1f} s" for t in frames]
-    pose = SimpleNamespace(qpos=arms[0].ref.qpos[first:])
+    pose = SimpleNamespace(qpos=arms[0].ref.qpos[first:]) if tracked else retarget.retarget(arms[0].char, clip)
     wide, beside = mujoco.MjvCamera(), np.array([0.0, 0.8, 0.0])  # both in the picture, whichever way they turn
     wide.type, wide.trackbodyid, wide.distance = mujoco.mjtCamera.mjCAMERA_TRACKING, arms[0].char.root, 3.5
     wide.azimuth, wide.elevation = 205, -8
     human = retarget.draw(arms[0].char, clip, pose, frames, size, wide, beside)
     rows = [(f"human and kinematic {name_of(arms[0].char)}: {clip.name}", human, times)]
     for a in arms:
-        act = policy_action(a.policy)
-        recording = simulate(a.char, a.seen, act, threads=opt.threads, only=[opt.sequence])[0]
+        recording, seen = played(a, clip, opt)
         lived = [t for t in frames if t < len(recording.frames)]
         gone = len(frames) - len(lived)
-        images = pictures(a.char, a.seen, recording, lived, size)
+        images = pictures(a.char, seen, recording, lived, size)
         images += [np.full_like(images[0], 255)] * gone
         end = f"failed at {(len(recording.frames) - 1) / rate:.1f} s"
         rows.append((a.title(), images, times[: len(lived)] + [end] * gone))
@@ -128,6 +131,22 @@ def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320)):
         sheet = render.contact_sheet(images, labels, len(images))
         sheets += [render.label_image(np.full((20, sheet.shape[1], 3), 120, np.uint8), title), sheet]
     return np.vstack(sheets)
+
+
+def played(arm: Arm, clip, opt: Options):
+    """What a policy did on the sequence that is shown, until it failed, and what it was shown of the user.
+
+    Args      clip : as `headset.player.stream_of` has it, where the policies are streamed
+    Test      tests/test_play.py::test_comparison_sheet_streamed"""
+    if "tracked" in opt.rows:
+        act = policy_action(arm.policy)
+        return simulate(arm.char, arm.seen, act, threads=opt.threads, only=[opt.sequence])[0], arm.seen
+    pos, quat = sensors(clip)
+    pos = pos * retarget.sensor_scale(arm.char, clip.hip_height, clip.measured)
+    [r] = ride(arm.char, arm.policy.mean_action, [(pos, quat)], arm.devices, opt.threads)
+    lived = [*np.flatnonzero(r.anew)[1:], len(r.qpos)][0]
+    seen = SimpleNamespace(sensor_pos=pos[:, : arm.devices], sensor_quat=quat[:, : arm.devices])
+    return SimpleNamespace(qpos=r.qpos[:lived], frames=np.arange(lived)), seen
 
 
 def pictures(char: Character, ref: Reference, recording: Recording, frames, size=(480, 360), fast=False):

@@ -11,6 +11,7 @@ import metrics
 import play
 import retarget
 from env import Env, headset_only
+from headset.player import ride, stream_of
 from headset.reader import controllers_hang
 from human import heading
 from mocap import data
@@ -394,6 +395,20 @@ def test_compare(two, tmp_path, capsys):
     assert "oppy scale 0.8, 1.5k steps, controllers hang" in capsys.readouterr().out
     with pytest.raises(UserError, match="oppy.npz|jesse.npz"):
         play.main(["--compare", *map(str, two), "--sensors", "full", *more])
+
+
+def test_comparison_sheet_streamed(two, monkeypatch):
+    """Without the tracked row: from the default pose, by the sensors of a stream, until the first fall."""
+    clip = data.sequences()[0]
+    opt = play.Options(compare=tuple(map(str, two)), rows=("streamed",), threads=1)
+    for arm in metrics.arms_of([clip], opt):
+        seen = stream_of(arm.char, clip)[2]
+        recording, shown = play.played(arm, seen, opt)
+        pos, quat, _, _ = stream_of(arm.char, clip, arm.devices)
+        np.testing.assert_allclose(shown.sensor_pos[:, 0], pos[:, 0], atol=1e-6)
+        [r] = ride(arm.char, arm.policy.mean_action, [(pos, quat)], arm.devices, 1)
+        np.testing.assert_allclose(recording.qpos[:10], r.qpos[:10], atol=1e-3)
+        assert len(recording.qpos) == len(recording.frames) <= len(r.qpos)
 
 
 def test_comparison_sheet(two, tmp_path, monkeypatch):
