@@ -377,7 +377,7 @@ def run(trainer: Trainer, loaded=None, before=0):
 
     Args      loaded : the checkpoint to continue from, or None; before : steps of the policies that it goes on from
     Raises    UserError: the motions have changed since the run began
-    Test      tests/test_ppo.py::test_resume_is_exact, test_interrupt_ends_with_a_checkpoint"""
+    Test      tests/robustness/test_killed.py::test_interrupt_ends_with_a_checkpoint, test_resume_after_sigkill"""
     opt, env, out, data = trainer.opt, trainer.env, Path(trainer.opt.out), trainer.data()
     if loaded:
         training.check_same(loaded[1].get("data", data), data, out)

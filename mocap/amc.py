@@ -124,7 +124,8 @@ def read_asf(path) -> Skeleton:
     Returns   Skeleton
     Raises    AmcError: the file is malformed (one line: file, line or bone, and what would have been valid)
               OSError: the file cannot be opened
-    Test      tests/mocap/test_amc.py::test_read_asf, ::test_malformed_asf, ::test_damaged_files_never_escape
+    Test      tests/mocap/test_amc.py::test_read_asf, ::test_malformed_asf,
+              tests/robustness/test_damaged.py::test_asf_and_amc
     """
     path = os.fspath(path)
     sections, name = {}, None
@@ -352,7 +353,8 @@ def read_amc(path, skeleton: Skeleton) -> np.ndarray:
     Returns   (T, C) float64, the values of `skeleton.columns`: [file units] and [rad]
     Raises    AmcError: the file is malformed or of another skeleton (one line: file, line, bone, what would be valid)
               OSError: the file cannot be opened
-    Test      tests/mocap/test_amc.py::test_read_amc, ::test_malformed_amc, ::test_damaged_files_never_escape
+    Test      tests/mocap/test_amc.py::test_read_amc, ::test_malformed_amc,
+              tests/robustness/test_damaged.py::test_asf_and_amc
     """
     path = os.fspath(path)
     rows = _text(path, "an AMC, which has frame numbers and a line for each bone").split("\n")

@@ -41,7 +41,7 @@ CHECKPOINT, PREVIOUS, CONFIG, METRICS = "checkpoint.npz", "checkpoint.prev.npz",
 class StopFlag:
     """Ctrl-C or SIGTERM ends a run after the present update, with a checkpoint; a second one at once.
 
-    Test      tests/test_ppo.py::test_interrupt_ends_with_a_checkpoint,
+    Test      tests/robustness/test_killed.py::test_interrupt_ends_with_a_checkpoint,
               tests/skeletal/test_skeletal_play.py::test_interrupt,
               tests/drop/test_drop_vae.py::test_interrupt
     """
@@ -208,7 +208,8 @@ def save_checkpoint(path, arrays, meta):
 
     Args      path : file; arrays : dict of name -> array, no objects; meta : dict that JSON can hold
     Raises    ValueError: an object array, or the name __meta__; UserError: the folder cannot be written
-    Test      tests/plumbing/test_runs.py::test_checkpoint_round_trip, test_killed_while_writing
+    Test      tests/plumbing/test_runs.py::test_checkpoint_round_trip,
+              tests/robustness/test_killed.py::test_killed_while_writing
     """
     path = Path(path)
     arrays = {name: np.asarray(value) for name, value in arrays.items()}

@@ -27,9 +27,6 @@ GROUPS = [f"spring_share.{g}" for g in ("ankle", "elbow", "head", "hip", "knee",
 KEYS += GROUPS
 
 
-pytestmark = pytest.mark.usefixtures("motions_once")
-
-
 @pytest.fixture(scope="module")
 def char():
     return character.load("jesse")

@@ -21,7 +21,6 @@ from plumbing.runs import save_checkpoint
 from policy import Policy, load_policy
 
 COLUMNS = [key for key, *_ in metrics.COLUMNS]
-pytestmark = pytest.mark.usefixtures("motions_once")
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,6 @@ from plumbing.cli import UserError
 from plumbing.runs import CHECKPOINT, save_checkpoint
 from policy import Policy, check_fits, load_policy, sensors_of, total_steps, trained_as
 
-pytestmark = pytest.mark.usefixtures("motions_once")
-
 
 def test_policy_round_trip(tmp_path, char, ref):
     """What is played is what was trained: the normaliser is in the file, and frozen."""

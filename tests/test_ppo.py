@@ -2,10 +2,6 @@
 
 import itertools
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -19,7 +15,7 @@ from character import TERMS
 from env import Env, Uniform
 from mocap import data
 from nn import gaussian_logp
-from plumbing import runs, training
+from plumbing import training
 from plumbing.cli import UserError
 from plumbing.runs import CHECKPOINT, CONFIG, METRICS, load_checkpoint, read_config, read_metrics, save_checkpoint
 from policy import Policy, load_policy
@@ -29,9 +25,6 @@ ROOT = Path(__file__).resolve().parent.parent
 TIMES = ("steps_per_s", "collect_s", "update_s")
 TINY = "--recipe none --clips *stand* --envs 8 --horizon 8 --minibatch 32".split()
 TINY += "--hidden 12 --value-hidden 10,8 --threads 1".split()
-
-
-pytestmark = pytest.mark.usefixtures("motions_once")
 
 
 def tiny(**changes):
@@ -497,61 +490,6 @@ def test_second_thread_changes_nothing(char, ref):
         ppo.aside(lambda: 1 / 0)()
 
 
-def test_resume_from_a_damaged_checkpoint(whole, tmp_path, capsys, monkeypatch):
-    """Cut short while it was written: the one before is taken, and the rows after it are made again."""
-    out = tmp_path / "a"
-    monkeypatch.setattr(ppo, "CHECKPOINT_SECONDS", 0)
-    train(out, 4)
-    newest = out / CHECKPOINT
-    newest.write_bytes(newest.read_bytes()[:-500])
-    with open(out / METRICS, "a") as file:
-        file.write("5,320,0.1")  # a row that was being written
-    (out / "checkpoint.tmp-1-abc.npz").write_bytes(b"half")
-    train(out, 6, "--resume")
-    assert "previous" in capsys.readouterr().err
-    assert not list(out.glob("*.tmp-*"))
-    assert_same_run(whole, out)
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
-def test_resume_after_sigkill(tmp_path):
-    """Killed among its checkpoints, which it writes after every update, a run continues to the same numbers."""
-    out = tmp_path / "killed"
-    often = "import sys, ppo; ppo.CHECKPOINT_SECONDS = 0; ppo.main(sys.argv[1:])"
-    command = [sys.executable, "-c", often, *TINY, "--steps", "1e9", "--out", str(out)]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    try:
-        deadline = time.monotonic() + 60
-        while not ((out / METRICS).exists() and (out / METRICS).read_text().count("\n") > 6):
-            assert process.poll() is None and time.monotonic() < deadline, process.stderr.read()
-            time.sleep(0.003)
-    finally:
-        process.kill()
-        process.communicate()
-    meta = runs.latest_checkpoint(out)[1]
-    assert meta["updates"] >= 4
-    train(out, meta["updates"] + 2, "--resume")
-    train(tmp_path / "whole", meta["updates"] + 2)
-    assert_same_run(tmp_path / "whole", out)
-
-
-def test_interrupt_ends_with_a_checkpoint(tmp_path, monkeypatch, capsys, whole, request):
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # some shells start their children without
-    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
-    lines = itertools.count(1)
-    monkeypatch.setattr(runs.Progress, "update", lambda *_: next(lines) == 2 and signal.raise_signal(signal.SIGINT))
-    _, meta = train(tmp_path / "a", 6)
-    assert meta["updates"] == 2
-    assert f"python ppo.py --resume --out {tmp_path / 'a'}" in capsys.readouterr().out
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    monkeypatch.setattr(runs.Progress, "update", lambda *_: None)
-    train(tmp_path / "a", 6, "--resume")
-    assert_same_run(whole, tmp_path / "a")
-    monkeypatch.setattr(runs.Progress, "update", lambda *_: [signal.raise_signal(signal.SIGTERM) for _ in range(2)])
-    with pytest.raises(KeyboardInterrupt):  # the second one: at once
-        train(tmp_path / "b", 6)
-
-
 def test_resume_refuses_other_options(whole, tmp_path, monkeypatch):
     before = {p: p.read_bytes() for p in whole.iterdir()}
     for flag, value in (("--lr", "1e-3"), ("--hidden", "64"), ("--seed", "1"), ("--clips", "*walk*"), ("--envs", "4")):
@@ -762,5 +700,3 @@ def test_config_tells_what_was_run(whole):
     config = read_config(whole)
     assert config["config"]["clips"] == "*stand*" and config["config"]["data"]["sequences"] == 1
     assert (whole / CONFIG).exists() and {"python", "mujoco"} <= set(config["versions"])
-
-

@@ -22,8 +22,6 @@ from plumbing.cli import UserError
 from plumbing.runs import load_checkpoint
 from policy import load_policy
 
-pytestmark = pytest.mark.usefixtures("motions_once")
-
 
 def trainer(char, ref, **options):
     opt = ppo.Options(**{"envs": 3, "horizon": 4, "minibatch": 6, "hidden": (16,), "value_hidden": (16,)} | options)

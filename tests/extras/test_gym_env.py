@@ -17,7 +17,7 @@ gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed 
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-pytestmark = [pytest.mark.usefixtures("motions_once"), pytest.mark.filterwarnings("ignore::DeprecationWarning")]
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 
 def actions(n, steps, size=33, scale=0.5, seed=0):

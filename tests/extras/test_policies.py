@@ -19,9 +19,6 @@ from plumbing.cli import UserError
 from plumbing.runs import CHECKPOINT, load_checkpoint, save_checkpoint
 from policy import Policy, load_policy, total_steps
 
-pytestmark = pytest.mark.usefixtures("motions_once")
-
-
 # ------------------------------------------------------------------------------------ ship, blend
 
 

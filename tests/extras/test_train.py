@@ -21,8 +21,6 @@ from plumbing.cli import UserError, run_main
 from plumbing.runs import CHECKPOINT, load_checkpoint, read_config
 from plumbing.training import motions
 
-pytestmark = pytest.mark.usefixtures("motions_once")
-
 
 def small(out="runs/x", **changes):
     return Options(**{"clips": "*stand*", "envs": 5, "horizon": 4, "threads": 1, "out": str(out)} | changes)

@@ -13,8 +13,6 @@ from mocap import gait
 from mocap.data import Clip, load
 from plumbing.cli import UserError
 
-pytestmark = pytest.mark.usefixtures("motions_once")
-
 
 @pytest.fixture(scope="module")
 def worn():

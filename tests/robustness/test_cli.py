@@ -37,9 +37,6 @@ RUNS = ("retarget", "ppo", "play")
 TINY = "--recipe none --clips *stand* --envs 4 --horizon 4 --steps 16 --hidden 8 --value-hidden 8 --threads 1".split()
 
 
-pytestmark = pytest.mark.usefixtures("motions_once")
-
-
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     """An empty current folder: whatever a script writes by default lands in it."""

@@ -13,8 +13,6 @@ from mocap import data as motion
 from plumbing.cli import UserError
 from skeletal import data
 
-pytestmark = pytest.mark.usefixtures("motions_once")
-
 
 def random_quats(n, seed=0):
     return Rotation.random(n, rng=np.random.default_rng(seed)).as_quat(scalar_first=True)

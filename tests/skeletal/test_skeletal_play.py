@@ -17,8 +17,6 @@ from plumbing.runs import CHECKPOINT, load_checkpoint, read_metrics, save_checkp
 from skeletal import data, play, train
 from skeletal.__main__ import main
 
-pytestmark = pytest.mark.usefixtures("motions_once")
-
 
 def run(*args):
     """The exit code of `python -m skeletal ARGS`, run in this process."""
