@@ -59,7 +59,7 @@ class Player:
         self, char: Character, act, n=1, rate=CONTROL_RATE, substeps=SUBSTEPS, force=None, devices=3, threads=1
     ):
         self.char, self.act, self.n, self.dt, self.substeps, self.force = char, act, n, 1.0 / rate, substeps, force
-        self.devices = devices
+        self.name, self.devices = char.name, devices  # as `Env` has them
         char.model.opt.timestep = self.dt / substeps
         self.batch = char.batch(n, threads)
         names = "qpos qvel ctrl qacc_warmstart xfrc_applied xpos xmat cvel geom_xpos geom_xmat site_xpos sensordata"

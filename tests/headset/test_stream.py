@@ -792,6 +792,19 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
     assert "a folder without recordings" in capsys.readouterr().err
 
 
+def test_policy_of_another_character(jesse, tmp_path, capsys, walk):
+    """A policy that does not fit is refused in a line that names both, for one recording and for a folder."""
+    (tmp_path / "a.csv").write_text("".join(to_csv(np.arange(len(walk)) / walk.rate, *sensors(walk))))
+    tiny_policy(jesse, tmp_path / "jesse.npz")
+    flags = ["--character", "dino", "--policy", str(tmp_path / "jesse.npz")]
+    for stream in (tmp_path / "a.csv", tmp_path):
+        with pytest.raises(SystemExit) as end:
+            run_main(play.main, [*flags, "--stream", str(stream)])
+        said = capsys.readouterr().err
+        assert end.value.code == 2 and said.count("\n") == 1
+        assert "jesse.npz: a policy of" in said and "dino needs" in said
+
+
 def wreck(samples, rng):
     """Every fault at once: zeros, NaN, absurd numbers, frozen, teleports, gaps, late and absurd times."""
     for k, s in enumerate(samples):
