@@ -102,6 +102,14 @@ def footfalls(contact, rate, apart=0.1) -> int:
     before = np.lib.stride_tricks.sliding_window_view(contact[:-1], n, axis=0).any(axis=-1)
     return int(np.sum(contact[n:] & ~before))
 
+
+def travelled(root) -> float:
+    """Length of the root's path on the floor [m].  (T, 3) -> float
+
+    Test      tests/test_metrics.py::test_metrics_on_known_motion, tests/mocap/test_mocap.py::test_inspect"""
+    return float(np.linalg.norm(np.diff(root[:, :2], axis=0), axis=-1).sum())
+
+
 SEGMENTS = (
     "pelvis", "chest", "head",
     "thigh_l", "shin_l", "foot_l", "thigh_r", "shin_r", "foot_r",

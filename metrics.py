@@ -34,6 +34,7 @@ from human import (
     quat_conj,
     quat_mul,
     quat_rotate,
+    travelled,
 )
 from human import footfalls as footfalls_apart
 from mocap.augment import resize
@@ -83,13 +84,6 @@ def footfalls(contact):
 
     Test      tests/test_metrics.py::test_steps_contacts_and_torques"""
     return footfalls_apart(contact, 1.0, apart=0.0)
-
-
-def travelled(root):
-    """Length of the root's path on the floor [m].  (T, 3) -> float
-
-    Test      tests/test_metrics.py::test_metrics_on_known_motion"""
-    return float(np.linalg.norm(np.diff(root[:, :2], axis=0), axis=-1).sum())
 
 
 def local_rotations(quat, parents):
@@ -560,10 +554,9 @@ def streamed(char: Character, act, clips, devices=3, threads=0) -> dict:
     rides = ride(char, act, [s[:2] for s in streams], devices, threads)
     pieces, first = [], []
     for start, r in zip(ref.first, rides, strict=True):
-        cuts = [*np.flatnonzero(r.anew), len(r.qpos)]
-        for a, b in zip(cuts[:-1], cuts[1:]):  # between two stands: a jump is no motion
+        for a, b in r.lives:
             pieces.append(Recording(start + np.arange(a, b), r.qpos[a:b], r.contact[a:b], r.action[a:b], False, b - a))
-        first.append(cuts[1] if r.failures else len(r.qpos))
+        first.append(r.lives[0][1] if r.failures else len(r.qpos))
     failed = np.array([r.failures > 0 for r in rides])
     failures, ticks = sum(r.failures for r in rides), np.array([len(r.qpos) for r in rides])
     return measure(char, ref, pieces) | {

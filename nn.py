@@ -468,6 +468,16 @@ class Adam:
         work *= self.lr / (1.0 - beta1**self.t)  # lr m^ / (sqrt(v^) + eps)
         theta -= work
 
+    def follow_kl(self, kl, target):
+        """Change lr by a factor of 1.2, within 1e-6 to 1e-2, where the last epoch's KL divergence is off its target.
+
+        ASSUMED   both factors: off is 1.3 times as much, or as little
+        Test      tests/test_ppo.py::test_rate_follows_kl_and_sigma_has_a_floor"""
+        if kl > 1.3 * target:
+            self.lr = max(self.lr / 1.2, 1e-6)
+        elif kl < target / 1.3:
+            self.lr = min(self.lr * 1.2, 1e-2)
+
     def state(self):
         r"""Copies of what a resumed run needs: t (), m (P,), v (P,).
 

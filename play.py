@@ -35,7 +35,7 @@ from character import Character
 from env import EPISODE_STEPS, Env
 from headset import axes, calibration
 from headset.player import Pace, Player, drive, ride, stream_of
-from headset.reader import AXES, DEVICES, GAP, SAMPLE_RATE, Reader, arriving, is_live, lines_of
+from headset.reader import AXES, DEVICES, GAP, SAMPLE_RATE, Reader, arriving, files_of, is_live, lines_of
 from human import heading, sensors
 from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_action, simulate
 from mocap.augment import resize
@@ -144,7 +144,7 @@ def played(arm: Arm, clip, opt: Options):
     pos, quat = sensors(clip)
     pos = pos * retarget.sensor_scale(arm.char, clip.hip_height, clip.measured)
     [r] = ride(arm.char, arm.policy.mean_action, [(pos, quat)], arm.devices, opt.threads)
-    lived = [*np.flatnonzero(r.anew)[1:], len(r.qpos)][0]
+    lived = r.lives[0][1]
     seen = SimpleNamespace(sensor_pos=pos[:, : arm.devices], sensor_quat=quat[:, : arm.devices])
     return SimpleNamespace(qpos=r.qpos[:lived], frames=np.arange(lived)), seen
 
@@ -373,10 +373,7 @@ def recordings_of(path) -> list[Path]:
 
     Raises    UserError: a folder without any
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
-    path = Path(path)
-    if not path.is_dir():
-        return [path]
-    files = sorted(f for f in path.rglob("*") if f.suffix.lower() == ".csv" and f.is_file())
+    files = files_of(path)
     if not files:
         raise UserError(f"--stream {path}: a folder without recordings; valid: one that holds .csv files")
     return files
@@ -418,20 +415,25 @@ def ticks_of(char: Character, path, devices: int, opt: Options):
     return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks])
 
 
-def summary_of(char: Character, rides, devices: int) -> dict:
-    """Seconds, failures and errors of one ride, or of several together.
+def slides_of(char: Character, ride) -> np.ndarray:
+    """`metrics.own_slide` of a ride, without the jumps to where it was stood up anew.
 
+    Test      tests/headset/test_stream.py::test_folder_of_recordings"""
+    soles = forward_kinematics(char, ride.qpos).soles
+    return np.concatenate([metrics.own_slide(soles[a:b], ride.contact[a:b], CONTROL_RATE) for a, b in ride.lives])
+
+
+def summary_of(rides, slides, devices: int) -> dict:
+    """Seconds, failures and errors of one ride, or of several together; `completed` is the share of them.
+
+    Args      slides : `slides_of` each
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
     ticks = sum(len(r.qpos) for r in rides)
     seconds, failures = ticks / CONTROL_RATE, sum(r.failures for r in rides)
-    slides = []
-    for r in rides:
-        soles, cuts = forward_kinematics(char, r.qpos).soles, [*np.flatnonzero(r.anew), len(r.qpos)]
-        slides += [metrics.own_slide(soles[a:b], r.contact[a:b], CONTROL_RATE) for a, b in zip(cuts[:-1], cuts[1:])]
     slides = np.concatenate(slides)
     return {
         "seconds": round(seconds, 3),
-        "completed": float(np.mean([r.failures == 0 for r in rides])) if len(rides) > 1 else failures == 0,
+        "completed": float(np.mean([r.failures == 0 for r in rides])),
         "failures": int(failures),
         "fails_every_s": seconds / failures if failures else None,
         "head_cm": 100 * sum(r.head for r in rides) / ticks,
@@ -457,8 +459,9 @@ def play_recordings(char: Character, policy, path, devices: int, opt: Options) -
     rides = ride(char, policy.mean_action, list(streams.values()), devices, opt.threads)
     top = Path(opt.stream)
     names = [str(f.relative_to(top)) if top.is_dir() else f.name for f in streams]
-    found = {"files": {n: summary_of(char, [r], read) for n, r in zip(names, rides)}}
-    found["all"] = summary_of(char, rides, read) | {"completed": float(np.mean([r.failures == 0 for r in rides]))}
+    slides = [slides_of(char, r) for r in rides]
+    each = (summary_of([r], [s], read) | {"completed": r.failures == 0} for r, s in zip(rides, slides))
+    found = {"files": dict(zip(names, each)), "all": summary_of(rides, slides, read)}
     for name, ends, row in zip(names, [r.ends for r in rides], found["files"].values()):
         print(line_of(name, ends, row))
     ends = sum((r.ends for r in rides), Counter())
@@ -525,6 +528,10 @@ def main(argv=None):
     if opt.compare:
         _compare(opt)
         return 0
+    if opt.measure:
+        metrics.run(opt)
+        if not (opt.png or opt.video or opt.bvh or opt.view):
+            return 0
     policy, path, meta = metrics.find_policy(opt)
     char = metrics.load_character(opt, meta, path)
     if opt.stream:
@@ -535,10 +542,7 @@ def main(argv=None):
                 return code
         play_stream(char, policy, path, devices, opt)
         return 0
-    if opt.measure:
-        metrics.run(opt)
-    if opt.png or opt.video or opt.bvh or opt.view:
-        look(char, policy, path, meta, opt)
+    look(char, policy, path, meta, opt)
     return 0
 
 

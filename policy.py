@@ -145,7 +145,8 @@ def _checked_shape(shape, arrays) -> dict:
 def check_fits(policy: Policy, env, path):
     """UserError if a policy was trained for another character or another observation than the environment's.
 
-    Test      tests/test_policy.py::test_policy_round_trip, tests/robustness/test_cli.py::test_broken_policy"""
+    Test      tests/test_policy.py::test_policy_round_trip,
+              tests/headset/test_stream.py::test_policy_of_another_character"""
     have, need = (policy.obs_size, policy.action_size), (env.obs_size, env.action_size)
     if have != need:
         raise UserError(

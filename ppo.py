@@ -37,7 +37,7 @@ from mocap import data
 from mocap.rigs import Reading
 from nn import Adam, clip_grad_norm, gaussian_entropy, gaussian_kl, gaussian_logp, gaussian_logp_backward, value_loss
 from plumbing import runs, training
-from plumbing.cli import ALL_POSITIVE, COUNT, NONNEGATIVE, POSITIVE, THREADS, UNIT, arg, run_main
+from plumbing.cli import ALL_POSITIVE, COUNT, NONNEGATIVE, POSITIVE, THREADS, UNIT, arg, run_main, some_of
 from policy import Policy, initial, widths
 
 FINITE = ("policy.*", "adam_*", "env.*")  # of a checkpoint's arrays
@@ -45,7 +45,7 @@ CHECKPOINT_SECONDS = 180.0
 MAX_GRAD_NORM = 1.0  # ASSUMED
 SOLVER = "pgs"  # ASSUMED: of contacts; a fifth faster than the exact one, by which policies are played
 BELOW_ONE = (lambda v: 0 < v < 1, "between 0 and 1")
-KNOWN = (lambda v: set(v) <= set(WITHOUT), f"one or several of {', '.join(WITHOUT)}")
+KNOWN = some_of(WITHOUT)
 
 
 @dataclass
@@ -308,11 +308,7 @@ class Trainer:
             kl = epochs[-1]["kl"]
             if kl > 2.0 * opt.target_kl:  # ASSUMED: leave the samples before they no longer describe the policy
                 break
-        # ASSUMED: the step size follows the KL divergence of the last epoch
-        if kl > 1.3 * opt.target_kl:
-            self.adam_pi.lr = max(self.adam_pi.lr / 1.2, 1e-6)
-        elif kl < opt.target_kl / 1.3:
-            self.adam_pi.lr = min(self.adam_pi.lr * 1.2, 1e-2)
+        self.adam_pi.follow_kl(kl, opt.target_kl)
         return self.told({k: fmean(e[k] for e in epochs) for k in epochs[0]} | {"kl": kl}, batch.explained)
 
     def fit_policy(self, batch, parts) -> dict:

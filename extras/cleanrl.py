@@ -152,9 +152,8 @@ class Trainer(ppo.Trainer):
             kl = fmean(kls)
             if opt.schedule == "kl" and kl > 2.0 * opt.target_kl:
                 break
-        if opt.schedule == "kl":  # as `ppo.Trainer.update`
-            change = 1 / 1.2 if kl > 1.3 * opt.target_kl else 1.2 if kl < opt.target_kl / 1.3 else 1.0
-            self.adam_pi.lr = float(np.clip(self.adam_pi.lr * change, 1e-6, 1e-2))
+        if opt.schedule == "kl":
+            self.adam_pi.follow_kl(kl, opt.target_kl)
         return self.told({k: fmean(r[k] for r in rows_of) for k in rows_of[0]} | {"kl": kl}, batch.explained)
 
     def limited(self, grad, value_grad):

@@ -23,7 +23,7 @@ from character import Character
 from env import SENSORS, WITHOUT, observation_terms
 from mocap import data
 from nn import MLP, RunningNorm
-from plumbing.cli import ALL_POSITIVE, POSITIVE, UNIT, UserError, arg, cli, given_flags, run_main
+from plumbing.cli import ALL_POSITIVE, POSITIVE, UNIT, UserError, arg, cli, given_flags, run_main, some_of
 from plumbing.files import check_folders
 from plumbing.runs import fmt_count, git_state, save_checkpoint, versions
 from policy import Policy, load_policy, sensors_of, total_steps, trained_as
@@ -298,9 +298,7 @@ class Carry(character.Switches):
     from_character: str | None = arg(None, ".toml of the body that it was trained with; its own by default")
     sensors: str | None = arg(None, "what it will see of the user: full, or hmd, the headset alone", choices=SENSORS)
     without: tuple[str, ...] = arg(
-        (),
-        "asymmetric: its critic will see no more than its actor [§5.3]",
-        check=(lambda v: set(v) <= set(WITHOUT), f"one or several of {', '.join(WITHOUT)}"),
+        (), "asymmetric: its critic will see no more than its actor [§5.3]", check=some_of(WITHOUT)
     )
     hidden: tuple[int, ...] | None = arg(None, "hidden layers of the policy, none narrower", check=ALL_POSITIVE)
     value_hidden: tuple[int, ...] | None = arg(None, "hidden layers of the value network", check=ALL_POSITIVE)

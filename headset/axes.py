@@ -204,7 +204,7 @@ def judge(samples, axes="unity", grip=None, unit=None, order=(0, 1, 2), devices=
     alike = [f for f in found if np.array_equal(AXES[f.axes], AXES[axes])]
     told = next((f for f in alike if f.order == tuple(order)), None)
     if told is None:
-        return [f"the devices fit a person in another order: --devices {','.join(DEVICES[k] for k in best.order)}"]
+        return [other_order(best)]
     used = UNIT.get(axes, 1.0) if unit is None else unit
     if best.unit not in (None, used):
         name = next(n for n, u in UNITS.items() if u == best.unit)
@@ -214,8 +214,7 @@ def judge(samples, axes="unity", grip=None, unit=None, order=(0, 1, 2), devices=
     gain = best.score - told.score - SWAPPED * ((best.order != (0, 1, 2)) - (told.order != (0, 1, 2)))
     if best is not told and gain > SURE:
         if best.order != told.order:
-            names = ",".join(DEVICES[k] for k in best.order)
-            lines.append(f"the devices fit a person in another order: --devices {names}")
+            lines.append(other_order(best))
         if not np.array_equal(AXES[best.axes], AXES[axes]):
             lines.append(f"hands, head and forearms fit a person with --axes {best.axes}, not {axes}: "
                          f"{best.score:.1f} to {told.score:.1f}")  # fmt: skip
@@ -227,6 +226,16 @@ def judge(samples, axes="unity", grip=None, unit=None, order=(0, 1, 2), devices=
             f"--grip {grip_of(angle):g}"
         )
     return lines
+
+
+def other_order(best: Fit) -> str:
+    """What is said of devices that are in another order.  Test: tests/headset/test_axes.py::test_wrong_axes"""
+    return f"the devices fit a person in another order: {devices_flag(best)}"
+
+
+def devices_flag(best: Fit) -> str:
+    """The flag of play.py for a fit's order.  Test: tests/headset/test_axes.py::test_wrong_axes"""
+    return f"--devices {','.join(DEVICES[k] for k in best.order)}"
 
 
 def grip_of(forearm) -> float:
@@ -249,7 +258,7 @@ def guess(samples, axes="unity", devices=3) -> Choice:
     grip = GRIP[best.axes]
     if best.forearm is not None and abs(best.forearm - grip) > GRIP_OFF:
         grip = grip_of(best.forearm)
-    order = "" if best.order == (0, 1, 2) else f" --devices {','.join(DEVICES[k] for k in best.order)}"
+    order = "" if best.order == (0, 1, 2) else f" {devices_flag(best)}"
     unit = None if best.unit in (None, UNIT.get(best.axes, 1.0)) else best.unit
     flags = f"--axes {best.axes} --grip {grip:g}{order}" + (f" --stream-unit {unit:g}" if unit else "")
     sure = "" if lead > SURE else f"; not sure: {rest[0].axes} fits nearly as well"

@@ -8,14 +8,12 @@ signal, as the kinematic retargeting is: the feet of the real player may have st
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from headset.calibration import Resampler, standing_height
-from headset.reader import Clock, Guard, Reader, Sample, lines_of, to_world
+from headset.reader import Clock, Guard, Reader, Sample, files_of, lines_of, to_world
 from human import SEG, SEGMENTS, SENSOR_OFFSETS, Clip, heading, quat_about, quat_continuous, quat_matrix, quat_rotate
 from mocap.data import CONTROL_RATE
 from mocap.gait import Body, smooth, two_bone_leg
@@ -156,22 +154,15 @@ def plant_feet(pelvis, yaw, half, height, rate):
 def two_bone_arm(shoulder, wrist, elbow, a, b):
     r"""Two-bone inverse kinematics of an arm: rotations of upper arm and forearm.
 
-    Equation  law of cosines in the plane of shoulder, wrist and `elbow`, the way in which the elbow points; a wrist out
-              of reach is pointed at
+    Equation  as a leg's knee (`mocap.gait.two_bone_leg`), in the plane of shoulder, wrist and `elbow`, the way in which
+              the elbow points; then half a turn about the bones, because an elbow bends the other way
     Args      shoulder, wrist, elbow : (T, 3) world; a, b : lengths of upper arm and forearm [m]
     Returns   (T, 3, 3) each, world
     Test      tests/headset/test_body.py::test_two_bone_arm
     """
-    d = wrist - shoulder
-    n = np.maximum(np.linalg.norm(d, axis=1), 1e-6)
-    r = np.clip(n, abs(a - b) + 1e-6, a + b - 1e-9)
-    z = -d / n[:, None]
-    y = np.cross(z, -elbow)
-    y /= np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
-    frame = np.stack([np.cross(y, z), y, z], axis=2)
-    alpha = np.arccos(np.clip((a * a + r * r - b * b) / (2 * a * r), -1, 1))
-    beta = np.arccos(np.clip((b * b + r * r - a * a) / (2 * b * r), -1, 1))
-    return frame @ quat_matrix(quat_about(1, alpha)), frame @ quat_matrix(quat_about(1, -beta))
+    upper, fore = two_bone_leg(shoulder, wrist, elbow, a, b)
+    half_turn = np.array([-1.0, -1.0, 1.0])
+    return upper * half_turn, fore * half_turn
 
 
 def players(folder, axes="unity") -> list[Clip]:
@@ -179,9 +170,8 @@ def players(folder, axes="unity") -> list[Clip]:
 
     Raises    UserError: no recordings there
     Test      tests/headset/test_body.py::test_recordings"""
-    files = sorted(Path(folder).rglob("*.csv")) if Path(folder).is_dir() else [Path(folder)]
     out = []
-    for file in files:
+    for file in files_of(folder):
         try:
             pos, quat = read_recording(file, axes)
             height = standing_height(pos[:, 0])

@@ -178,6 +178,12 @@ class Ride:
     def failures(self):
         return sum(self.ends.values())
 
+    @property
+    def lives(self) -> list[tuple[int, int]]:
+        """(first tick, the one after the last) from each stand to the next; between two of them a jump is no motion."""
+        cuts = [*map(int, np.flatnonzero(self.anew)), len(self.qpos)]
+        return list(zip(cuts[:-1], cuts[1:]))
+
 
 def ride(char: Character, act, streams, devices=3, threads=0) -> list[Ride]:
     """Drive one character a stream, side by side with those whose streams are about as long.

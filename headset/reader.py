@@ -8,6 +8,7 @@ import sys
 import threading
 from collections import Counter
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -260,6 +261,16 @@ def is_live(path) -> bool:
     if kind not in (None, "a pipe"):
         raise UserError(f"--stream {path}: is {kind}; valid: {valid}")
     return kind is not None
+
+
+def files_of(path) -> list[Path]:
+    """The CSV files of a folder and below it, perhaps none; or the file itself.
+
+    Test      tests/headset/test_stream.py::test_folder_of_recordings, tests/headset/test_body.py::test_recordings"""
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    return sorted(f for f in path.rglob("*") if f.suffix.lower() == ".csv" and f.is_file())
 
 
 def lines_of(path):

@@ -66,7 +66,7 @@ def split_of(path) -> str:
 
 
 BUILTIN = {"builtin": gait.MIX, "standing": gait.STANDING}  # the data sets that need no download
-MOTION = "builtin, standing, a .bvh or .amc file, or a folder of them; or several with commas between them"
+MOTION = "builtin, standing, a .bvh or .amc file, a folder of them, several with commas between them"
 
 
 @dataclass
@@ -100,16 +100,13 @@ def builtin_clips(rate=CONTROL_RATE, seed=0, name="builtin") -> list[Clip]:
     return out
 
 
-SETS = "builtin, standing, a .bvh or .amc file, a folder of them, several with commas between them"
-
-
 def parts(motion) -> list[str]:
     """The data sets of a --motion: one, or several with commas between them (unless a file has that name).
 
     Test      tests/mocap/test_mocap.py::test_joined"""
     sets = str(motion).split(",") if not Path(motion).exists() else [str(motion)]
     if "" in sets:
-        raise UserError(f"--motion {motion}: an empty name, a comma too many; valid: {SETS}")
+        raise UserError(f"--motion {motion}: an empty name, a comma too many; valid: {MOTION}")
     return sets
 
 
@@ -165,7 +162,7 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
     else:
         path = Path(motion)
         if not path.exists():
-            raise UserError(f"{motion}: no such file or folder; valid: {SETS}")
+            raise UserError(f"{motion}: no such file or folder; valid: {MOTION}")
         files = files_of(path)
         if not files:
             raise UserError(f"{motion}: a folder without motion; valid: one that holds .bvh or .amc files")

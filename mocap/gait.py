@@ -395,17 +395,17 @@ def _foot(plan, body, p, style, side, scale):
 def two_bone_leg(hip, ankle, forward, a, b):
     r"""Two-bone inverse kinematics: rotations of thigh and shin, knee towards `forward`.
 
-    Equation  law of cosines in the plane of hip, ankle and forward
+    Equation  law of cosines in the plane of hip, ankle and forward; an ankle out of reach is pointed at
     Args      hip, ankle, forward : (T, 3) world; a, b : thigh and shin length [m]
     Returns   thigh, shin : (T, 3, 3)
-    Test      tests/mocap/test_gait.py::test_limbs_have_constant_length
+    Test      tests/mocap/test_gait.py::test_limbs_have_constant_length, tests/headset/test_body.py::test_two_bone_arm
     """
     d = ankle - hip
-    n = np.linalg.norm(d, axis=1)
+    n = np.maximum(np.linalg.norm(d, axis=1), 1e-6)
     r = np.clip(n, abs(a - b) + 1e-6, a + b - 1e-9)
     z = -d / n[:, None]
     y = np.cross(z, forward)
-    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    y /= np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
     frame = np.stack([np.cross(y, z), y, z], 2)
     alpha = np.arccos(np.clip((a * a + r * r - b * b) / (2 * a * r), -1, 1))
     beta = np.arccos(np.clip((b * b + r * r - a * a) / (2 * b * r), -1, 1))

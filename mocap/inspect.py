@@ -7,9 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-import numpy as np
-
-from human import Clip, contacts, footfalls, resample
+from human import Clip, contacts, footfalls, resample, travelled
 from mocap import bvh, data, fetch, rigs
 from mocap.data import CONTROL_RATE, _sequences, load
 from mocap.rigs import AS_IT_IS, Reading, from_amc, is_amc
@@ -31,23 +29,18 @@ def numbers(clip: Clip | None, warnings=()) -> dict:
             "rate": round(clip.rate, 4),
             "frames": len(clip),
             "seconds": round(clip.seconds, 4),
-            "speed": round(travelled(clip) * clip.rate / max(len(clip) - 1, 1), 4),
+            "speed": round(travelled(clip.pos[:, 0]) * clip.rate / max(len(clip) - 1, 1), 4),
             "hips": round(clip.hip_height, 4),
             "contact": round(float(contacts(clip).mean()), 4),
         }
     return out | {"warnings": list(warnings)}
 
 
-def travelled(clip: Clip) -> float:
-    """Path of the pelvis over the ground [m].  Test: tests/mocap/test_mocap.py::test_inspect"""
-    return float(np.linalg.norm(np.diff(clip.pos[:, 0, :2], axis=0), axis=-1).sum())
-
-
 def describe(clip: Clip) -> str:
     """Rate, length, speed and contacts of a clip in one line; the balls' mean height while the feet are in contact.
 
     Test      tests/mocap/test_mocap.py::test_inspect"""
-    travel = travelled(clip)
+    travel = travelled(clip.pos[:, 0])
     speed = travel * clip.rate / max(len(clip) - 1, 1)
     c = contacts(clip)
     height = f"{100 * clip.ball[c, 2].mean():.1f}" if c.any() else "-"

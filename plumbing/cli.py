@@ -68,6 +68,11 @@ THREADS = (lambda v: 0 <= v <= 1024, "from 0 to 1024")
 ALL_POSITIVE = (lambda v: len(v) > 0 and all(x > 0 for x in v), "one or more numbers greater than 0, as in 256,128")
 
 
+def some_of(names):
+    """The check of a tuple of names.  Test: tests/test_ppo.py::test_recipe"""
+    return (lambda v: set(v) <= set(names)), f"one or several of {', '.join(names)}"
+
+
 def arg(default, help, choices=None, flag=None, check=None, metavar=None):
     """Declare one dataclass field that is also a command-line flag.
 

@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 from scipy.stats import norm
+from test_env import fresh, velocity
 
 import character
 import env as rules
@@ -53,21 +54,6 @@ def rng():
     return np.random.default_rng(2023)
 
 
-def physics(env, n):
-    """MuJoCo's own arrays at the state of character n."""
-    data = mujoco.MjData(env.char.model)
-    data.qpos[:], data.qvel[:] = env.qpos[n], env.qvel[n]
-    mujoco.mj_forward(env.char.model, data)
-    return data
-
-
-def velocity(data, body):
-    """Angular and linear velocity of a body's origin, world."""
-    out = np.zeros(6)
-    mujoco.mj_objectVelocity(data.model, data, mujoco.mjtObj.mjOBJ_XBODY, body, out, 0)
-    return out[:3], out[3:]
-
-
 def floor_frame(root, R):
     """§3.3: a point in the frame on the floor below the root, turned with its heading; and a vector in it."""
     left = R[:, 1]
@@ -78,7 +64,7 @@ def floor_frame(root, R):
 
 def o_sim(env, n):
     """Eq. 3, from MuJoCo's arrays, link by link."""
-    d, links = physics(env, n), env.char.obs_links
+    d, links = fresh(env, n), env.char.obs_links
     point, vector = floor_frame(d.qpos[:3], d.xmat[env.char.root].reshape(3, 3))
     spin, _ = velocity(d, env.char.root)
     x = [point(d.xpos[i]) for i in links]
@@ -88,7 +74,7 @@ def o_sim(env, n):
 
 def o_user(env, n, t):
     """Eq. 4, device by device; in the frame of the present state, whatever the frame t of the motion."""
-    d, ref = physics(env, n), env.ref
+    d, ref = fresh(env, n), env.ref
     point, vector = floor_frame(d.qpos[:3], d.xmat[env.char.root].reshape(3, 3))
     hlr = [point(p) for p in ref.sensor_pos[t]]
     return np.concatenate([*hlr, *(vector(rotation(q).as_matrix())[:, :2].ravel() for q in ref.sensor_quat[t])])
@@ -233,7 +219,7 @@ def test_3_3_frame_turns_with_the_heading(rng):
 def test_3_3_critic_sees_the_human_and_its_future(env):
     """Joints of the mocap pose now, and 1, 5 and 15 frames ahead; the actor's part holds none of it."""
     for n in range(N):
-        d, t = physics(env, n), env.frame[n]
+        d, t = fresh(env, n), env.frame[n]
         point, _ = floor_frame(d.qpos[:3], d.xmat[env.char.root].reshape(3, 3))
         end = env.ref.last[env.sequence[n]]
         for name, k in (("human_pos", 0), ("human_pos_in_1", 1), ("human_pos_in_5", 5), ("human_pos_in_15", 15)):
@@ -326,7 +312,7 @@ def test_eq_8_every_term_by_its_distance(env, rng):
     terms = env.reward_terms(a)
     for n in range(N):
         q = sum((env.qpos[n, 7 + i] - ref.qpos[t[n], 7 + i]) ** 2 for i in range(c.j)) / c.j
-        ẋ = [velocity(physics(env, n), b)[1] for b in c.reward_links]
+        ẋ = [velocity(fresh(env, n), b)[1] for b in c.reward_links]
         d = dict(q=q, xd=np.mean(np.sum((ẋ - ref.link_vel[t[n]]) ** 2, axis=1)),
                  contact=np.linalg.norm(1.0 * env.contact[n] - ref.contact[t[n]]),
                  action_diff=np.mean((a[n] - env.action[n]) ** 2), action_min=np.mean(a[n] ** 2))  # fmt: skip
@@ -376,7 +362,7 @@ def test_3_5_orientation_is_the_humans(env, ref):
     for n in range(N):
         M = ref.human_rot[t[n]][[human.SEG["pelvis"], human.SEG["head"]]]  # two columns; the third is their product
         user = Rotation.from_matrix(np.dstack([M[..., 0], M[..., 1], np.cross(M[..., 0], M[..., 1])]))
-        gt, sim = user * rotation(c.rest[[c.root, c.head]]), rotation(physics(env, n).xquat[[c.root, c.head]])
+        gt, sim = user * rotation(c.rest[[c.root, c.head]]), rotation(fresh(env, n).xquat[[c.root, c.head]])
         angle = (gt * sim.inv()).magnitude().mean()
         assert terms["orientation"][n] == pytest.approx(w * math.exp(-k * angle), rel=1e-4)
 
@@ -428,7 +414,7 @@ def test_3_6_upper_body_on_the_ground(char, ref, rng):
     env.refresh()
     fallen = rules.fallen(character.geom_lowest(char.model, char.fall_geoms, env.geom_xpos, env.geom_xmat).min(1))
     for n in range(60):
-        d = physics(env, n)
+        d = fresh(env, n)
         bodies = {char.model.body(char.model.geom_bodyid[g]).name for c in d.contact[: d.ncon] for g in c.geom}
         assert fallen[n] == bool({b for b in bodies if not b.startswith(("world", "thigh", "shin", "foot"))})
     assert 10 < fallen.sum() < 50

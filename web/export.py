@@ -21,6 +21,7 @@ import numpy as np
 
 import character
 from character import CHARACTERS, Character
+from env import observation_terms
 from headset.reader import AXES, COLUMNS
 from human import Clip, sensors
 from mocap import gait
@@ -28,7 +29,7 @@ from mocap.stitch import _join, motion_features
 from nn import LEAKY_SLOPE
 from plumbing.cli import UserError, arg, cli
 from plumbing.files import atomic_write
-from policy import load_policy, sensors_of, trained_as
+from policy import devices_of, load_policy, trained_as
 from retarget import headset
 
 FORMAT, VERSION = "sparse-retarget-web", 1
@@ -58,9 +59,9 @@ def tables(char: Character, policy, meta, path) -> tuple[dict, dict]:
     """
     if char.variant.get("tail", "active") != "active" or "scale" in char.variant:
         raise UserError(f"{path}: its body varies (tail, scale), which the MJCF's text does not say; valid: neither")
-    devices = 1 if sensors_of(meta, path) == "hmd" else 3
+    devices = devices_of(meta, path, None)
     m, norm, n = char.model, policy.norm, policy.obs_size
-    actions, observations = len(char.limits), 2 * char.j + 6 + 9 * len(char.obs_links) + 18 * devices
+    actions, observations = len(char.limits), sum(observation_terms(char, devices)["actor"].values())
     if (n, policy.action_size) != (observations, actions):
         have, need = f"{n} observations and {policy.action_size} actions", f"{observations} and {actions}"
         raise UserError(f"{path}: a policy of {have}; {char.name} needs {need}")

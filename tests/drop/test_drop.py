@@ -43,6 +43,7 @@ from drop.body import (
     swing_twist,
     twists,
 )
+from drop.demos import forearm
 from drop.prior import ClipPrior, NearestPrior, SwitchPrior
 from drop.simulator import Box, Plane, Simulator, Spheres, State, Weights
 from human import Clip, quat_matrix
@@ -534,22 +535,6 @@ def test_momentum_is_conserved():
     np.testing.assert_allclose(total(pushed)[0], p + STEP * N * GRAVITY, atol=1e-9)
 
 
-def pendulum(theta, restore=True, steps=60, **settings):
-    """The left forearm swinging from a held elbow: angles (steps + 1,), largest bone error."""
-    sim = Simulator(None, weights=Weights(constraint=1e5), contact=False, limits=None, restore=restore, **settings)
-    e, w = J["elbow_l"], J["wrist_l"]
-    x = STAND.copy()
-    x[w] = x[e] + LENGTHS[w - 1] * np.array([np.sin(theta), 0.0, -np.cos(theta)])
-    pins = {j: x[j].copy() for j in range(N) if j != w}
-    state, angles, worst = sim.begin(x, REST), [theta], 0.0
-    for _ in range(steps):
-        state, _ = sim.step(state, pins=pins)
-        bone = state.x[w] - state.x[e]
-        angles.append(np.arctan2(bone[0], -bone[2]))
-        worst = max(worst, abs(np.linalg.norm(bone) / LENGTHS[w - 1] - 1))
-    return np.array(angles), worst
-
-
 def period(angle):
     cross = [i + angle[i] / (angle[i] - angle[i + 1]) for i in range(len(angle) - 1) if angle[i] * angle[i + 1] < 0]
     return 2 * STEP * np.mean(np.diff(cross))
@@ -566,11 +551,11 @@ def test_pendulum(degrees):
         t_eval=np.arange(61) * STEP,
         rtol=1e-9,
     ).y[0]
-    angle, worst = pendulum(theta)
+    angle, worst = forearm(Weights(), degrees)
     assert worst < 0.01
     assert abs((theta - angle[10]) / (theta - exact[10]) - 1) < 0.10
     assert abs(period(angle) / period(exact) - 1) < 0.10
-    assert pendulum(theta, restore=False)[1] < 0.05  # strong springs alone
+    assert forearm(Weights(), degrees, restore=False)[1] < 0.05  # strong springs alone
 
 
 def test_restore_bones():

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_env import rollout
 from test_ppo import TINY, assert_same_run
 
 import character
@@ -161,15 +162,6 @@ def test_begun_episodes_stand(char, visited):
 
 
 # ------------------------------------------------------------------------------------ disturbance
-
-
-def rollout(env, steps, seed=0):
-    rng, rows = np.random.default_rng(seed), []
-    for _ in range(steps):
-        _, reward, terminated, truncated, info = env.step(0.8 * rng.standard_normal((env.n, 33)))
-        terms = info["terms"].values()
-        rows.append(np.column_stack([terminated, truncated, info["critic"], reward, *terms, env.qpos, env.qvel]))
-    return np.stack(rows)
 
 
 def test_disturbance(char, ref):

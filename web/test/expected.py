@@ -22,7 +22,7 @@ from headset.reader import Reader, lines_of  # noqa: E402
 from mocap.bvh import read  # noqa: E402
 from plumbing.cli import UserError  # noqa: E402
 from retarget import write_bvh  # noqa: E402
-from web.export import NAMES, load_policy, sensors_of, trained_as  # noqa: E402
+from web.export import NAMES, devices_of, load_policy, trained_as  # noqa: E402
 
 STEPS, SECONDS = 240, 20.0
 
@@ -49,7 +49,7 @@ def loop(path):
         policy, meta = load_policy(shipped)
         char = trained_as(meta, shipped).load()
         entry = {"physics": physics(char)}
-        devices = 1 if sensors_of(meta, shipped) == "hmd" else 3
+        devices = devices_of(meta, shipped, None)
         player, roots = Player(char, policy.mean_action, devices=devices), []
 
         count, when = player.ends[0].copy(), []
