@@ -1,4 +1,4 @@
-"""mocap.guess."""
+"""A rig that is in no table: which joint is which segment, by names; how its axes stand, by where the body moves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""mocap.stitch.stitch."""
+"""Short clips joined into sequences of half a minute: each is entered where pose and velocity fit the last one."""
 
 from __future__ import annotations
 
