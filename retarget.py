@@ -195,26 +195,53 @@ def sensor_scale(char: Character, hip_height: float, headset_height: float) -> n
     return scale
 
 
-def euler_angles(q, axes: str):
+OUTSIDE, SMALL = 10.0, 0.01  # ASSUMED: what a triple of angles costs, beside its jumps (`euler_angles`)
+
+
+def euler_angles(q, axes: str, low=-np.inf, high=np.inf):
     r"""Angles of intrinsic turns about `axes` (1 to 3 letters) that make the rotation q.
 
     Equation  q = q_{a1}(α1) q_{a2}(α2) q_{a3}(α3); with fewer than three hinges the turns about the missing axes,
               ordered last, are dropped: what the character cannot do (ASSUMED: not the nearest reachable rotation)
-    Args      q (T, 4); axes : letters of "xyz", none twice
-    Returns   (T, len(axes)) [rad], unwrapped in time
-    Test      tests/test_retarget.py::test_euler_angles
+    Method    two triples make one rotation, (α1, α2, α3) and (α1 + π, π − α2, α3 + π).  Of each frame's two those are
+              taken that cost least over the whole motion (Viterbi's shortest path):
+              Σ_t ‖α_t − α_{t−1}‖² + OUTSIDE ‖α_t beyond low, high‖² + SMALL ‖α_t‖²; a missing axis allows 0 alone
+    Why       an arm raised by 150 degrees is (0, 150, 0), not (180, 30, 180), which no shoulder's range holds
+    Args      q (T, 4); axes : letters of "xyz", none twice; low, high : a hinge's range [rad], one or each
+    Returns   (T, len(axes)) [rad]: about an axis with a range within π of its middle, otherwise unwrapped in time
+    Test      tests/test_retarget.py::test_euler_angles, test_arms_above_the_head
     """
-    seq = axes + "".join(a for a in "yxz" if a not in axes)
-    angles = Rotation.from_quat(q, scalar_first=True).as_euler(seq.upper())
-    # Two triples make one rotation; take the one with the smaller angles: an arm raised sideways by 150 degrees is
-    # (0, 150, 0), not (180, 30, 180).
-    other = angles + np.array([np.pi, 0.0, np.pi])
-    other[:, 1] = np.pi - angles[:, 1]
+    seq, n = axes + "".join(a for a in "yxz" if a not in axes), len(axes)
+    low, high = (np.concatenate([np.broadcast_to(v, n).astype(float), np.zeros(3 - n)]) for v in (low, high))
+    ranged = np.isfinite(low) & np.isfinite(high)
+    middle = np.where(ranged, low + np.where(ranged, high - low, 0.0) / 2, 0.0)
     wrap = lambda a: (a + np.pi) % (2 * np.pi) - np.pi  # noqa: E731
-    other = wrap(other)
-    far = np.abs(other).sum(1) < np.abs(angles).sum(1) - 1e-9
-    angles = np.where(far[:, None], other, angles)
-    return np.unwrap(angles, axis=0)[:, : len(axes)]
+    first = Rotation.from_quat(q, scalar_first=True).as_euler(seq.upper())
+    both = np.stack([first, np.array([np.pi, np.pi, np.pi]) + first * [1.0, -1.0, 1.0]], axis=1)  # (T, 2, 3)
+    both = middle + wrap(both - middle)
+    beyond = np.maximum(low - both, 0.0) + np.maximum(both - high, 0.0)
+    cost = OUTSIDE * np.square(beyond).sum(2) + SMALL * np.square(both).sum(2)
+    jump = both[1:, None, :, :n] - both[:-1, :, None, :n]  # from one of two to one of two
+    jump = np.square(np.where(ranged[:n], jump, wrap(jump))).sum(3)
+    angles = both[np.arange(len(q)), shortest(cost, jump), :n]
+    return np.where(ranged[:n], angles, np.unwrap(angles, axis=0))
+
+
+def shortest(cost, jump):
+    r"""Viterbi's path through two choices a frame.
+
+    Equation  the choices k_t that minimise  Σ_t cost[t, k_t] + Σ_t jump[t, k_t, k_{t+1}]
+    Args      cost (T, 2); jump (T − 1, 2, 2)
+    Returns   (T,) int
+    Test      tests/test_retarget.py::test_shortest"""
+    (a, b), came = cost[0].tolist(), []
+    for (c, d), ((aa, ab), (ba, bb)) in zip(cost[1:].tolist(), jump.tolist(), strict=True):  # lists: 20 times as fast
+        came.append((b + ba < a + aa, b + bb < a + ab))
+        a, b = c + min(a + aa, b + ba), d + min(a + ab, b + bb)
+    path = [int(b < a)]
+    for two in reversed(came):
+        path.append(int(two[path[-1]]))
+    return np.array(path[::-1])
 
 
 @dataclass
@@ -255,7 +282,8 @@ def retarget(char: Character, clip: Clip) -> Pose:
             angles += sign * char.default[hinges]
         else:
             wanted = quat_mul(quat_mul(quat_conj(done), turn), char.rest[body])
-            angles = euler_angles(quat_mul(quat_conj(local), wanted), axes)
+            allowed = np.sort(sign[:, None] * char.ranges[hinges], axis=1).T
+            angles = euler_angles(quat_mul(quat_conj(local), wanted), axes, *allowed)
         for k, axis in enumerate(axes):
             local = quat_mul(local, quat_about("xyz".index(axis), angles[:, k]))
         chains[a, b] = quat_mul(done, quat_mul(local, quat_conj(char.rest[body])))

@@ -43,9 +43,10 @@ RETRY, PLACES = (3, 60), 512  # ASSUMED: steps before a failure from which it is
 LATE = 1.5  # ASSUMED: s for which a fast user excuses that the character is late
 MOST = 2.0  # ASSUMED: a beginning that fails more often than so many times the mean is drawn no more often for it
 SHORTEST = 1.0  # s of a clip that is made a visit
+RUNS = 2.0  # m/s, ASSUMED: a stitched sequence with a faster second is made visits, too
 PLAYERS_STAND = 1.5  # ASSUMED: s at a recording's beginning in which a player stands well enough to start under
 PUSH_SECONDS = 2.0  # mean time between pushes
-CODE = 1  # counts up when retargeting or augmenting changes what it makes: older caches are then made anew
+CODE = 2  # counts up when retargeting or augmenting changes what it makes: older caches are then made anew
 CHUNK = 100  # clips retargeted between two lines of progress
 
 
@@ -215,20 +216,22 @@ class Disturbance:
 
 
 def clips_of(opt: Options) -> list:
-    """The stitched training sequences; with `augment` twice, with `visits` every single clip as a visit, too.
+    """The stitched training sequences; with `augment` twice, with `visits` every single clip as a visit, too, and every
+    sequence that runs: a run of two seconds is over before its user has sped up.
 
     Test      tests/extras/test_train.py::test_clips"""
-    reading, single, clips = Reading.of(opt), [], []
+    reading, single, clips, runs = Reading.of(opt), [], [], []
     for each in data.parts(opt.motion):  # as `data.sequences`, but the single clips are wanted, too, and read once
         say(f"reading {each}")
         found = data.load(each, clips=opt.clips, split="train", reading=reading)
-        single += found
-        clips += found if len(found) == 1 else data._sequences(found, f"{each} [train]", opt.seed)
+        made = found if len(found) == 1 else data._sequences(found, f"{each} [train]", opt.seed)
+        single, clips, once = single + found, clips + made, set(map(id, found))
+        runs += [c for c in made if id(c) not in once and augment.fastest_second(c) > RUNS]
     if opt.augment:
         say(f"augmenting {len(clips)} sequences")
         clips = augment.augment(clips, np.random.default_rng([opt.seed, 3]))
     if opt.visits or opt.begin:
-        single = [c for c in single if c.seconds >= SHORTEST]
+        single = [c for c in single if c.seconds >= SHORTEST] + runs
         if not single:
             raise UserError(f"--motion {opt.motion}: no clip of {SHORTEST:g} s or more to make a visit of")
         say(f"making visits of {len(single)} clips")

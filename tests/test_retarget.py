@@ -397,6 +397,37 @@ def test_euler_angles_go_on():
     np.testing.assert_allclose(retarget.euler_angles(around, "z")[:, 0], 4.5 * np.pi * t, atol=1e-6)
 
 
+def test_shortest(rng):
+    """The path of least cost: against all 2^9 of them."""
+    cost, jump = rng.random((9, 2)), rng.random((8, 2, 2))
+    total = lambda k: sum(cost[range(9), k]) + sum(jump[range(8), k[:-1], k[1:]])  # noqa: E731
+    best = min((np.array(k) for k in itertools.product((0, 1), repeat=9)), key=total)
+    assert np.array_equal(retarget.shortest(cost, jump), best)
+    assert retarget.shortest(cost[:1], jump[:0]).tolist() == [int(cost[0].argmin())]
+
+
+@pytest.mark.parametrize("side", "lr")
+def test_arms_above_the_head(char, side):
+    """An arm that is raised forward, obliquely and sideways to 150 degrees, and comes down: the character's upper arm
+    points where the user's does, and no hinge turns by a half turn from one frame to the next."""
+    n = 120
+    lift = np.radians(150) * np.sin(np.linspace(0, np.pi, n))
+    for azimuth in np.radians([0, 30, 60, 90]):  # 0 forward, 90 sideways
+        clip = clip_of("stand", 4.0)[:n]
+        out = np.sin(azimuth) * (1.0 if side == "l" else -1.0)
+        turn = Rotation.from_rotvec(lift[:, None] * np.array([out, -np.cos(azimuth), 0.0]))
+        quat, arm = clip.quat.copy(), SEG[f"upper_arm_{side}"]
+        chest = Rotation.from_quat(quat[:, SEG["chest"]], scalar_first=True)
+        quat[:, arm] = (chest * turn).as_quat(scalar_first=True)
+        pose = retarget.retarget(char, dataclasses.replace(clip, quat=quat))
+        hinges = [k for k, name in enumerate(char.hinges) if name.startswith(f"shoulder_{side}")]
+        assert np.abs(np.diff(pose.qpos[:, 7 + np.array(hinges)], axis=0)).max() < 0.15  # 3.1 with a triple a frame
+        body = mujoco.mj_name2id(char.model, mujoco.mjtObj.mjOBJ_BODY, f"upper_arm_{side}")
+        got = Rotation.from_quat(retarget.forward_kinematics(char, pose.qpos).xquat[:, body], scalar_first=True)
+        away = got.apply([0.0, 0.0, -1.0]) - Rotation.from_quat(quat[:, arm], scalar_first=True).apply([0.0, 0.0, -1.0])
+        assert np.linalg.norm(away, axis=1).max() < 1e-6
+
+
 def test_sensor_scale(char, mini):
     """A user who stands upright wears the headset as high as the character, whatever the proportions."""
     for body in ({}, {"height": 1.2}, {"trunk": 1.3}, {"arms": 0.8}):

@@ -1,0 +1,170 @@
+r"""A teacher that sees the pose, and a student that copies it: arms follow before they are rewarded for it  (ours).
+
+    python -m extras.teacher --character jesse --motion FOLDER --init characters/jesse.npz --steps 1500000 --out runs/t
+    python ppo.py --character jesse --motion FOLDER --init runs/t --out runs/a               then PPO goes on from it
+
+Eq. 8's kernel is flat where an arm is far from the user's: with Table 2's k a hanging arm that should be raised earns
+e^-10 of its reward, and a little higher earns no more.  So PPO leaves it hanging, and elbows alone bend.  What an arm
+should do is no secret, though: the kinematic pose is known in training, and a PD controller on it says which torque
+leads there.
+
+    state ──► student's noisy action ──► next state                          the student drives [Ross11]
+      ├─────► teacher: PD torque of the arms, the old policy's action elsewhere ──┐
+      └─────► student's mean action ──────────────────────────────────────────────┴─► squared error, Adam
+
+The student sees sensors alone, as ever.  Its normaliser stays as it was; its critic learns what the new actions are
+worth.
+
+[Ross11]  Ross, Gordon and Bagnell, A reduction of imitation learning and structured prediction to no-regret online
+          learning, AISTATS 2011
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from statistics import fmean
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as ppo.py does, and says why; before NumPy is loaded
+
+import mujoco
+import numpy as np
+
+import ppo
+from character import Character, joint_group, numberless
+from env import Env
+from extras import train
+from nn import clip_grad_norm
+from plumbing.cli import POSITIVE, UserError, arg, run_main
+from plumbing.training import progress_line, read_options
+from policy import load_policy, widths
+
+RATE, DAMPING = 10.0, 0.7  # rad/s and of critical damping, ASSUMED: of the teacher's arms, spring included
+FARTHEST = 0.5  # rad, ASSUMED: an arm farther off is pulled no harder
+
+
+@dataclass
+class Options(train.Options):
+    """extras/train.py's options, and which joints are taught."""
+
+    BY = "extras.teacher"
+
+    joints: tuple[str, ...] = arg(("shoulder", "elbow"), "groups of driven joints that are taught", metavar="NAME,…")
+    teacher_lr: float = arg(3e-4, "learning rate of the student's copying", check=POSITIVE)
+
+
+def taught(char: Character, groups) -> np.ndarray:
+    """The motors of groups of joints.  UserError: a group that the character has not
+
+    Test      tests/extras/test_teacher.py::test_taught"""
+    names = [numberless(joint_group(char.hinges[h])) for h in char.driven]
+    if odd := set(groups) - set(names):
+        raise UserError(f"--joints {','.join(sorted(odd))}: valid: {', '.join(sorted(set(names)))}")
+    return np.flatnonzero(np.isin(names, list(groups)))
+
+
+def inertia(char: Character) -> np.ndarray:
+    """What each driven hinge turns in the default pose: the joint-space inertia's diagonal.  (u,) [kg m²]
+
+    Test      tests/extras/test_teacher.py::test_teacher_holds_an_arm"""
+    m, data, full = char.model, mujoco.MjData(char.model), np.zeros((char.model.nv, char.model.nv))
+    data.qpos[2], data.qpos[3:7], data.qpos[7:] = char.hip_height, char.rest[char.root], char.default
+    mujoco.mj_forward(m, data)
+    mujoco.mj_fullM(m, data, full)
+    return np.diag(full)[6 + char.driven].copy()
+
+
+class Teacher:
+    r"""Torques that bring driven joints to the kinematic pose, as actions.
+
+    Equation  τ = c + k (q* − q_spring) + (I ω² − k) clip(q* − q) − (2 ζ I ω − d) q̇,   a = clip(τ / τ_max, −1, 1)
+    Symbols   c gravity and Coriolis torques; k of the joint's spring, d its damping; I `inertia`; ω RATE; ζ DAMPING;
+              neither bracket below 0; clip at ± FARTHEST
+    Why       spring and damper do their part by themselves, so that together the joint answers as I (ω², 2ζω)
+    Test      tests/extras/test_teacher.py::test_teacher_holds_an_arm
+    """
+
+    def __init__(self, env: Env):
+        char, m, dof = env.char, env.char.model, 6 + env.char.driven
+        self.env, self.bias, self.dof = env, env.batch.bind("qfrc_bias"), dof
+        i = inertia(char)
+        self.spring, self.rest = m.jnt_stiffness[dof - 5], m.qpos_spring[dof + 1]
+        self.stiffness = np.maximum(i * RATE**2 - self.spring, 0.0)
+        self.damping = np.maximum(2.0 * DAMPING * i * RATE - m.dof_damping[dof], 0.0)
+        self.limits = char.limits
+
+    def __call__(self):
+        """(N, u) of the present states."""
+        env, wanted = self.env, self.env.ref.qpos[self.env.frame][:, 1 + self.dof]
+        error = np.clip(wanted - env.qpos[:, 1 + self.dof], -FARTHEST, FARTHEST)
+        torque = self.bias[:, self.dof] + self.spring * (wanted - self.rest)
+        torque += self.stiffness * error - self.damping * env.qvel[:, self.dof]
+        return np.clip(torque / self.limits, -1.0, 1.0)
+
+
+class Student(ppo.Trainer):
+    """Collects as PPO does, and copies: the teacher's arms, and what it was itself elsewhere.
+
+    Test     tests/extras/test_teacher.py::test_student_copies, test_resume_is_exact"""
+
+    def __init__(self, opt: Options, env: Env, policy=None):
+        super().__init__(opt, env, policy)
+        self.old, _ = load_policy(opt.init)
+        self.arms, self.teacher = taught(env.char, opt.joints), Teacher(env)
+        self.wanted = np.zeros_like(self.mu)
+        self.adam_pi.lr = opt.teacher_lr
+
+    def step(self, t):
+        """As PPO's, and what the student should have done."""
+        self.wanted[t] = self.old.mean_action(self.env.full[:, : self.env.obs_size])
+        self.wanted[t][:, self.arms] = self.teacher()[:, self.arms]
+        super().step(t)
+
+    def update(self) -> dict:
+        r"""Epochs of minibatches of the two losses.
+
+        Equation  mean over samples and motors of (μ(o) − a*)²; the critic's is PPO's
+        """
+        opt, batch, epochs = self.opt, self.samples(), []
+        wanted = self.wanted.reshape(batch.mu.shape)
+        for _ in range(opt.epochs):
+            order = self.rng.permutation(len(batch.adv))
+            parts = [order[k : k + opt.minibatch] for k in range(0, len(order), opt.minibatch)]
+            losses = [self.copy(batch.x[rows], wanted[rows]) for rows in parts]
+            epochs.append({"policy_loss": fmean(losses), "value_loss": self.fit_critic(batch, parts)})
+        found = {k: fmean(e[k] for e in epochs) for k in epochs[0]}
+        error = batch.mu - wanted
+        found["taught_rms"] = float(np.sqrt(np.mean(error[:, self.arms] ** 2)))
+        found["kept_rms"] = float(np.sqrt(np.mean(np.delete(error, self.arms, axis=1) ** 2)))
+        return self.told(found | {"kl": 0.0, "clip_fraction": 0.0}, batch.explained)
+
+    def copy(self, x, wanted) -> float:
+        """One step of the actor's weights; the noise stays.  -> the loss
+
+        Test      tests/extras/test_teacher.py::test_copy"""
+        policy = self.policy
+        mu, cache = policy.actor.forward(x[:, : policy.obs_size])
+        error = mu - wanted
+        _, gradient = policy.actor.backward(2.0 * error / error.size, cache, want_dx=False)
+        gradient = np.concatenate([gradient, np.zeros_like(policy.log_std)])
+        clip_grad_norm(gradient, ppo.MAX_GRAD_NORM)
+        self.adam_pi.step(policy.theta_pi, gradient)
+        return float(np.mean(np.square(error)))
+
+    @staticmethod
+    def line(stats) -> dict:
+        """The progress line: how far the student is from its teacher, as shares of the torque limits."""
+        plain = {k: v for k, v in progress_line(stats).items() if k not in ("kl", "clip")}
+        return plain | {"taught": f"{stats['taught_rms']:.3f}", "kept": f"{stats['kept_rms']:.3f}"}
+
+
+def main(argv=None):
+    """python -m extras.teacher: by the character's recipe.  Test: tests/extras/test_teacher.py::test_command"""
+    opt = read_options(Options, argv, "extras.teacher", __doc__, widths)
+    if not (opt.init or opt.resume):
+        raise UserError("--init: a teacher needs a student that walks; valid: a policy's .npz or a run folder")
+    ppo.train(opt, train.make_env(opt), trainer=Student)
+
+
+if __name__ == "__main__":
+    run_main(main)

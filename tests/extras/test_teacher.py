@@ -1,0 +1,129 @@
+"""extras/teacher.py: torques that lead to the kinematic pose, and a student that copies them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from test_ppo import TINY, assert_same_run
+
+import ppo
+from env import Env
+from extras import teacher, train
+from plumbing.cli import UserError, run_main
+from plumbing.runs import CHECKPOINT, load_checkpoint
+from policy import load_policy
+
+
+def run(out, updates, *more):
+    """Run (or resume) the command line in this process, to `updates` updates in all."""
+    args = list(more) if "--resume" in more else [*TINY, *more]
+    teacher.main([*args, "--out", str(out), "--steps", str(64 * updates)])
+    return load_checkpoint(Path(out) / CHECKPOINT)
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory):
+    """A run to begin from."""
+    out = tmp_path_factory.mktemp("start") / "a"
+    train.main([*TINY, "--out", str(out), "--steps", "64"])
+    return out
+
+
+def test_taught(char):
+    """Groups of joints by name; another name is refused with the valid ones."""
+    names = [char.hinges[char.driven[j]] for j in teacher.taught(char, ("shoulder", "elbow"))]
+    assert len(names) == 8 and all(n.startswith(("shoulder", "elbow")) for n in names)
+    with pytest.raises(UserError, match="--joints tail: valid: .*knee"):
+        teacher.taught(char, ("shoulder", "tail"))
+
+
+def test_teacher_holds_an_arm(char, ref):
+    """At rest in a raised pose its torque is what MuJoCo's inverse dynamics asks for to stay there.  Beside the pose,
+    or moving, the arm accelerates with ω² and 2ζω, and no harder beyond FARTHEST; the inertia is mj_inverse's, too."""
+    arms = teacher.taught(char, ("shoulder",))
+    q, v = 7 + char.driven[arms], 6 + char.driven[arms]
+    raised = 0.3 * np.sign(char.model.jnt_range[v - 5].sum(axis=1))
+    wanted = np.tile(ref.qpos[:1], (len(ref), 1))
+    wanted[:, q] = raised
+    env = Env(char, replace(ref, qpos=wanted, qvel=0 * ref.qvel), 3, threads=1, autoreset=False)
+    env.reset(frames=np.repeat(ref.first[0], 3))
+    act = teacher.Teacher(env)
+    env.qpos[1, q] -= 0.1
+    env.qpos[2, q] -= 0.6
+    env.refresh()
+    m, data, at = char.model, mujoco.MjData(char.model), teacher.inertia(char)[arms]
+    data.qpos[:], data.qpos[2] = env.qpos[0], 5.0  # in the air: no contact
+    mujoco.mj_inverse(m, data)
+    torque = act()[:, arms] * char.limits[arms]
+    np.testing.assert_allclose(torque[0], data.qfrc_inverse[v], rtol=1e-6, atol=1e-6)
+    pulled = at * teacher.RATE**2
+    strong = pulled > m.jnt_stiffness[v - 5]  # elsewhere the spring alone is quicker
+    assert strong.sum() == 4  # about the long axis of the arm it is
+    for k, error in ((1, 0.1), (2, teacher.FARTHEST)):
+        gain = torque[k] - act.bias[k, v] - act.spring[arms] * (raised - act.rest[arms])
+        np.testing.assert_allclose(gain, error * np.maximum(pulled - act.spring[arms], 0.0), rtol=1e-6, atol=1e-6)
+    env.qpos[1], env.qvel[1, v] = env.qpos[0], 0.01  # too slow for Coriolis forces
+    env.refresh()
+    slowed = (act()[1, arms] * char.limits[arms] - torque[0]) / -0.01
+    critical = 2 * teacher.DAMPING * at * teacher.RATE - m.dof_damping[v]
+    np.testing.assert_allclose(slowed, np.maximum(critical, 0.0), atol=2e-3)
+
+    data.qpos[:2], data.qpos[3:7], data.qpos[7:] = 0.0, char.rest[char.root], char.default
+    mujoco.mj_inverse(m, data)
+    still = data.qfrc_inverse[v].copy()
+    for j, dof in enumerate(v):  # the torque that gives this hinge alone 1 rad/s²
+        data.qacc[:] = 0.0
+        data.qacc[dof] = 1.0
+        mujoco.mj_inverse(m, data)
+        np.testing.assert_allclose(data.qfrc_inverse[dof] - still[j], at[j], rtol=1e-6)
+
+
+def test_copy(start):
+    """The step is along the squared error's gradient: against central differences in float64; the noise stays."""
+    small = dict(clips="*stand*", envs=4, horizon=4, threads=1, hidden=(8,), value_hidden=(8,))
+    opt = teacher.Options(init=str(start), **small)
+    student = teacher.Student(opt, ppo.make_env(opt))
+    policy, rng, seen = student.policy, np.random.default_rng(0), []
+    x, wanted = rng.standard_normal((6, policy.obs_size)), rng.standard_normal((6, policy.action_size))
+    student.adam_pi.step = lambda theta, gradient: seen.append(gradient.copy())
+    before, n, actor = policy.theta_pi.copy(), policy.actor.n_params, policy.actor
+    loss = student.copy(x.astype(np.float32), wanted.astype(np.float32))
+    assert not seen[0][n:].any() and np.array_equal(policy.theta_pi, before)
+    error = lambda theta: (setattr(actor, "theta", theta), np.mean((actor.forward(x)[0] - wanted) ** 2))[1]  # noqa: E731
+    exact = before[:n].astype(float)
+    np.testing.assert_allclose(loss, error(exact), rtol=1e-5)
+    found = []
+    for k in (some := rng.choice(n, 40, replace=False)):
+        step = np.eye(1, n, k)[0] * 1e-6
+        found.append((error(exact + step) - error(exact - step)) / 2e-6)
+    given = seen[0][some]
+    cosine = given @ found / np.linalg.norm(given) / np.linalg.norm(found)  # clipping keeps the direction
+    assert cosine > 1 - 1e-6
+
+
+def test_student_copies(start, tmp_path):
+    """Arms come nearer to the teacher, the rest stays near what it was; PPO goes on from it."""
+    run(tmp_path / "a", 50, "--init", str(start), "--epochs", "4", "--teacher-lr", "0.003")
+    rows = [row.split(",") for row in (tmp_path / "a" / "metrics.csv").read_text().splitlines()]
+    taught, kept = (np.array([float(r[rows[0].index(name)]) for r in rows[1:]]) for name in ("taught_rms", "kept_rms"))
+    assert taught[-10:].mean() < 0.7 * taught[:3].mean() and kept[-10:].mean() < 0.1
+    old, new = load_policy(start)[0], load_policy(tmp_path / "a")[0]
+    assert np.array_equal(old.norm.mean, new.norm.mean) and np.array_equal(old.log_std, new.log_std)
+    train.main([*TINY, "--init", str(tmp_path / "a"), "--out", str(tmp_path / "b"), "--steps", "64"])
+
+
+def test_resume_is_exact(start, tmp_path):
+    """Two updates, then two more, are four."""
+    run(tmp_path / "whole", 4, "--init", str(start))
+    run(tmp_path / "a", 2, "--init", str(start))
+    run(tmp_path / "a", 4, "--resume")
+    assert_same_run(tmp_path / "whole", tmp_path / "a")
+
+
+def test_command(tmp_path, capsys):
+    """Without a student it says what it needs, in one line."""
+    with pytest.raises(SystemExit):
+        run_main(teacher.main, [*TINY, "--out", str(tmp_path / "a")])
+    assert "--init: a teacher needs a student" in capsys.readouterr().err
