@@ -4,6 +4,7 @@ r"""Watch one policy: picture, video, viewer, BVH; on a motion or a headset's re
     python play.py --character jesse --stream FOLDER --json OUT                 many recordings, side by side
     python play.py --character jesse --motion FOLDER --png OUT | --video OUT    headless pictures
     python play.py --character jesse --motion FOLDER --bvh OUT                  what the character did, as BVH
+    python play.py --character jesse --stream FILE.csv --bvh OUT --bvh-names unity    of a stream, by Unity's names
     python play.py --character jesse --motion FOLDER --view | --view web        MuJoCo's viewer: window or browser
     python play.py --character jesse --motion FOLDER --measure [--json OUT]     every metric (metrics.py)
     python play.py --character jesse --motion FOLDER --measure --push 400@2     the largest push survived
@@ -53,22 +54,9 @@ OF_STREAM = {"axes", "grip", "stream_unit", "devices", "sample_rate", "user_heig
 
 
 @dataclass
-class Options(metrics.Options):
-    """Which policy, on which motion or under which headset, and what to make of it."""
+class StreamFlags:
+    """The flags of every command that is driven by a headset: which, and how it is to be read."""
 
-    measure: bool = arg(False, f"print every metric, a row each of {', '.join(ROWS)} (metrics.py)")
-    sequence: int = arg(0, "which sequence to show", check=NONNEGATIVE)
-    seconds: float | None = arg(None, "how much of it to show: 10 s by default, all of a stream", check=POSITIVE)
-    every: float | None = arg(
-        None, "seconds between the pictures of the contact sheet: 0.5; with --compare eight pictures", check=POSITIVE
-    )
-    png: str | None = arg(None, "write a contact sheet")
-    video: str | None = arg(None, "write a video (.mp4; needs the extra `view`)")
-    bvh: str | None = arg(None, "write what the character did, until it failed or the episode ended, as BVH")
-    view: str | None = arg(
-        None, "show it live: window (MuJoCo's viewer) or web (in a browser)", choices=("window", "web")
-    )
-    port: int = arg(0, "port of the browser viewer, 0 = the first free one from 8080", check=NONNEGATIVE)
     stream: str | None = arg(
         None, "drive the character with a headset's .csv file, a named pipe, or - for standard input"
     )
@@ -88,7 +76,26 @@ class Options(metrics.Options):
     user_height: float | None = arg(
         None, "height of the standing user's headset [m]; from the stream's first second by default", check=POSITIVE
     )
+
+
+@dataclass
+class Options(retarget.BvhFlags, StreamFlags, metrics.Options):
+    """Which policy, on which motion or under which headset, and what to make of it."""
+
+    measure: bool = arg(False, f"print every metric, a row each of {', '.join(ROWS)} (metrics.py)")
+    sequence: int = arg(0, "which sequence to show", check=NONNEGATIVE)
+    seconds: float | None = arg(None, "how much of it to show: 10 s by default, all of a stream", check=POSITIVE)
+    every: float | None = arg(
+        None, "seconds between the pictures of the contact sheet: 0.5; with --compare eight pictures", check=POSITIVE
+    )
+    png: str | None = arg(None, "write a contact sheet")
+    video: str | None = arg(None, "write a video (.mp4; needs the extra `view`)")
+    view: str | None = arg(
+        None, "show it live: window (MuJoCo's viewer) or web (in a browser)", choices=("window", "web")
+    )
+    port: int = arg(0, "port of the browser viewer, 0 = the first free one from 8080", check=NONNEGATIVE)
     realtime: bool = arg(False, "play a stream at the wall clock's pace and report the deadlines missed")
+
 
 # ------------------------------------------------------------------------------------ looking
 
@@ -280,7 +287,7 @@ def _open_viewer(model, data, root, how, port):
 
 # ------------------------------------------------------------------------------------ a headset's stream
 
-PICTURED = 600.0  # s of a stream that pictures are kept of, at most
+KEPT = 600.0  # s of a stream that are kept for pictures and BVH, at most
 
 
 def watched(samples, watch: axes.Watch):
@@ -293,15 +300,15 @@ def watched(samples, watch: axes.Watch):
         yield sample
 
 
-def play_stream(char: Character, policy, path, devices: int, opt: Options) -> None:
-    """Drive the character with a recorded or live headset; print what happened.
+def follow(char: Character, policy, path, devices: int, opt, see, pace: Pace | None = None, push: Push | None = None):
+    """Drive the character with a recorded or live headset until it ends; print what happened.
 
     Args      devices : what the policy was trained with; of 3, two hang beside the body with --sensors hmd
+              opt : StreamFlags with `sensors` and `seconds`; see : as `headset.player.drive` has it
     Raises    UserError: the stream cannot be read, or shows no headset for a second
     Test      tests/headset/test_stream.py::test_command_line, test_stdin, test_web_view
     """
     live = is_live(opt.stream)
-    push = parse_push(opt.push)
     read = 1 if opt.sensors == "hmd" else devices
     player = Player(char, policy.mean_action, force=push.force if push else None, devices=devices)
     check_fits(policy, player, path)
@@ -311,11 +318,23 @@ def play_stream(char: Character, policy, path, devices: int, opt: Options) -> No
     if live:  # a file's axes were looked at before
         samples = watched(samples, axes.Watch(source.axes, source.grip, source.unit, tuple(source.order), read))
     print(*said, sep="\n", end="\n" if said else "", flush=True)
-    pace = Pace(player.dt) if opt.realtime or opt.view else None
     if live and pace:
         samples = arriving(samples, GAP, player.dt)
-    seen = []
-    keep = PICTURED / player.dt if opt.png or opt.video else 0
+    with contextlib.suppress(KeyboardInterrupt):  # the end of a live stream; what happened is still told
+        drive(source, samples, player, opt.seconds, pace, see)
+    if source.calibration is None:
+        raise UserError(f"{reader.name}: {source.uncalibrated()}")
+    unreadable = [f"{reader.unreadable} lines could not be read"] if reader.unreadable else []
+    print(*source.report(), *unreadable, *player.report(), *(pace.report() if pace else []), sep="\n")
+
+
+def play_stream(char: Character, policy, path, devices: int, opt: Options) -> None:
+    """Drive the character with a headset; show it, picture it, write it as BVH.
+
+    Test      tests/headset/test_stream.py::test_command_line, test_stdin, test_web_view, test_stream_as_bvh
+    """
+    seen, dt = [], 1.0 / CONTROL_RATE
+    keep = KEPT / dt if opt.png or opt.video or opt.bvh else 0
     with contextlib.ExitStack() as stack:
         handle = None
         if opt.view:
@@ -336,15 +355,13 @@ def play_stream(char: Character, policy, path, devices: int, opt: Options) -> No
                 handle.sync()
                 return handle.is_running()
 
-        with contextlib.suppress(KeyboardInterrupt):  # the end of a live stream; what happened is still told
-            drive(source, samples, player, opt.seconds, pace, see)
-    if source.calibration is None:
-        raise UserError(f"{reader.name}: {source.uncalibrated()}")
-    unreadable = [f"{reader.unreadable} lines could not be read"] if reader.unreadable else []
-    print(*source.report(), *unreadable, *player.report(), *(pace.report() if pace else []), sep="\n")
+        pace = Pace(dt) if opt.realtime or opt.view else None
+        follow(char, policy, path, devices, opt, see, pace, parse_push(opt.push))
     if seen:
         qpos, pos, quat = map(np.array, zip(*seen, strict=True))
         recording = SimpleNamespace(qpos=qpos, frames=np.arange(len(qpos)))
+        if opt.bvh:
+            opt.write_bvh(char, qpos, CONTROL_RATE)
         _write_pictures(char, SimpleNamespace(sensor_pos=pos, sensor_quat=quat), recording, len(qpos) - 1, opt)
 
 
@@ -500,15 +517,15 @@ def check_options(opt: Options, argv) -> None:
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(wrong))
         says = "are of a motion, and --stream has none" if opt.stream else "are of --stream FILE"
         raise UserError(f"{flags} {says}: leave out the one or the other")
-    if opt.stream and opt.bvh:
-        raise UserError("--bvh records a motion, not a stream; give one of the two")
+    opt.check_bvh()
     if opt.stream and opt.measure:
         raise UserError("--measure compares with a human's motion, which a stream has not; give one of the two")
     if opt.json and not (opt.measure or opt.compare or opt.stream):
         raise UserError("--json writes the table of --measure, --compare or --stream: give one of them")
     many = opt.stream and Path(opt.stream).is_dir()
-    if many and (opt.png or opt.video or opt.view or opt.realtime or opt.push):
-        raise UserError(f"--stream {opt.stream}: is a folder, played side by side: leave out pictures, --view, --push")
+    if many and (opt.png or opt.video or opt.bvh or opt.view or opt.realtime or opt.push):
+        says = "is a folder, played side by side: leave out pictures, --bvh, --view, --push"
+        raise UserError(f"--stream {opt.stream}: {says}")
     if opt.stream and opt.json and (opt.realtime or opt.push):
         raise UserError("--stream with --json plays as it is: leave out --push and --realtime")
     if opt.stream and opt.json and not many and is_live(opt.stream):
@@ -538,7 +555,7 @@ def main(argv=None):
         devices = metrics.devices_of(meta, path, opt.sensors)
         if opt.json or Path(opt.stream).is_dir():
             code = play_recordings(char, policy, path, devices, opt)
-            if not (opt.png or opt.video or opt.view):
+            if not (opt.png or opt.video or opt.bvh or opt.view):
                 return code
         play_stream(char, policy, path, devices, opt)
         return 0
@@ -558,14 +575,24 @@ def _compare(opt: Options) -> None:
         print(opt.png)
 
 
-def look(char: Character, policy, path, meta, opt: Options) -> None:
-    """Picture, film, write as BVH or show one sequence.  Test: tests/robustness/test_cli.py::test_play_png"""
+def sequence_of(char: Character, opt) -> Reference:
+    """The sequence that the options name, for this character.
+
+    Args      opt : Options, or others that say which motion: MotionFlags with `all`, `split`, `seed`, `sequence`,
+              `user_scale`
+    Raises    UserError: there are not so many
+    Test      tests/test_play.py::test_what_cannot_be_done_is_said_first"""
     split = "all" if opt.all else opt.split
     clips = mocap.data.sequences(opt.motion, split, opt.clips, seed=opt.seed, reading=Reading.of(opt))
     if opt.sequence >= len(clips):
         raise UserError(f"--sequence {opt.sequence}: there are {len(clips)}, from 0")
     clip = clips[opt.sequence]
-    ref = retarget.reference(char, [clip if opt.user_scale == 1.0 else resize(clip, opt.user_scale)])
+    return retarget.reference(char, [clip if opt.user_scale == 1.0 else resize(clip, opt.user_scale)])
+
+
+def look(char: Character, policy, path, meta, opt: Options) -> None:
+    """Picture, film, write as BVH or show one sequence.  Test: tests/robustness/test_cli.py::test_play_png"""
+    ref = sequence_of(char, opt)
     seen, push = metrics.shown_to(meta, path, ref, opt.sensors), parse_push(opt.push)
     check_fits(policy, Env(char, seen, 1), path)
     if opt.png or opt.video or opt.bvh:
@@ -581,8 +608,7 @@ def look(char: Character, policy, path, meta, opt: Options) -> None:
             + (f"; pushed by {push.newtons:g} N at {push.at:g} s" if push and push.at < lived else "")
         )
         if opt.bvh:
-            retarget.write_bvh(opt.bvh, char, recording.qpos, CONTROL_RATE)
-            print(opt.bvh)
+            opt.write_bvh(char, recording.qpos, CONTROL_RATE)
         _write_pictures(char, seen, recording, min(last, len(recording.frames) - 1), opt)
     if opt.view:
         show(char, seen, policy, 0, opt.view, opt.port, push)

@@ -6,6 +6,7 @@ r"""Human pose -> character pose  [Reda23 §3.4].
 The kinematic pose slides, floats and sinks: it is a training signal, not a result.
 
     python retarget.py --character jesse --motion PATH [--png OUT | --video OUT | --bvh OUT]
+    python retarget.py --motion PATH --bvh OUT --bvh-names unity       its joints as Mixamo, Unity or VRM call them
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from human import (
     quat_rotate,
     sensors,
 )
+from mocap import humanoid
 from mocap.bvh import BvhError, write
 from mocap.data import MotionFlags, load
 from mocap.rigs import Reading
@@ -426,54 +428,93 @@ def artefacts(char: Character, clip: Clip, pose: Pose) -> dict:
 # ------------------------------------------------------------------------------------ export
 
 
-def write_bvh(path, char: Character, qpos, rate) -> None:
+OWN = "own"  # names of the character's own bodies, and its own frames
+
+
+def write_bvh(path, char: Character, qpos, rate, names=OWN) -> None:
     r"""A character's motion as BVH: a joint for each of its bodies.
 
     Method    rotation of a body in its parent, all its hinges in one; the root also moves.  OFFSETs are those of the
               bodies' origins; an End Site lies as far beyond its body's centre of mass as that from the origin
+    Names     of a standard: `mocap.humanoid`'s, and its rest pose is a T: without any turn the file shows that.  A body
+              between two bones (the third of a spine of four) is held; the next bone turns for both, and has positions
+              where that moves its origin (by up to 3 mm when Dino jogs): the pose is the same
+    Equation  the joint's turn from the T-pose  G_b = R_b T_b⁻¹, in the file G_parent⁻¹ G_b; OFFSETs are T_parent o_b
     Frame     y up, z forward, x left, centimetres, as animation tools expect: (x, y, z) of ours is (z, x, y)
-    Args      qpos (T, nq); rate [Hz]
+    Args      qpos (T, nq); rate [Hz]; names : "own" or one of `mocap.humanoid.NAMES`
     Raises    UserError: the file cannot be written, or a body's origin moves in its parent (a hinge beside it)
-    Test      tests/test_retarget.py::test_bvh_round_trip, ::test_bvh_in_another_library
+    Test      tests/test_retarget_bvh.py::test_bvh_round_trip, ::test_bvh_in_another_library, ::test_bvh_of_a_standard
     """
     m, fk = char.model, forward_kinematics(char, qpos)
     bodies = [b for b in range(1, m.nbody) if m.body_rootid[b] == char.root]
     parents = np.array([bodies.index(m.body_parentid[b]) if b != char.root else -1 for b in bodies])
     to_file = lambda v: np.roll(v, -1, axis=-1)  # noqa: E731  (x, y, z) -> (y, z, x): left, up, forward
-    local, offsets = fk.xquat[:, bodies], np.zeros((len(bodies), 3))
+    own = names == OWN
+    rest = np.tile([1.0, 0, 0, 0], (m.nbody, 1)) if own else humanoid.t_pose(char)
+    called = [m.body(b).name or f"body{b}" for b in range(m.nbody)] if own else humanoid.names(char, names)
+    turned, held = quat_mul(fk.xquat, quat_conj(rest)), [] if own else humanoid.between(char)
+    local, offsets, moving = turned[:, bodies], np.zeros((len(bodies), 3)), {}
     for k, (b, p) in enumerate(zip(bodies, m.body_parentid[bodies])):
-        if b != char.root:
-            back = quat_conj(fk.xquat[:, p])
-            local[:, k] = quat_mul(back, fk.xquat[:, b])
-            offset = quat_rotate(back, fk.xpos[:, b] - fk.xpos[:, p])
-            offsets[k] = offset.mean(axis=0)
-            if np.abs(offset - offsets[k]).max() > 1e-6:
-                raise UserError(
-                    f"{path}: a hinge of {m.body(b).name} lies beside the body's origin: BVH has no such joint"
-                )
+        if b == char.root:
+            continue
+        offset = quat_rotate(quat_conj(fk.xquat[:, p]), fk.xpos[:, b] - fk.xpos[:, p])
+        offsets[k] = quat_rotate(rest[p], offset.mean(axis=0))
+        if np.abs(offset - offset.mean(axis=0)).max() > 1e-6:
+            raise UserError(f"{path}: a hinge of {m.body(b).name} lies beside the body's origin: BVH has no such joint")
+        if b in held:
+            turned[:, b] = turned[:, p]
+        back = quat_conj(turned[:, p])
+        local[:, k] = quat_mul(back, turned[:, b])
+        place = quat_rotate(back, fk.xpos[:, b] - fk.xpos[:, p])
+        if np.abs(place - offsets[k]).max() > 1e-6:  # its parent is held
+            moving[called[b]] = 100.0 * to_file(place)
     local = np.concatenate([local[..., :1], to_file(local[..., 1:])], axis=-1)
-    names = [m.body(b).name or f"body{b}" for b in bodies]
-    leaves = {n: 200.0 * to_file(m.body_ipos[b]) for n, b in zip(names, bodies) if b not in m.body_parentid[bodies]}
+    leaves = [b for b in bodies if b not in m.body_parentid[bodies]]
+    ends = {called[b]: 200.0 * to_file(quat_rotate(rest[b], m.body_ipos[b])) for b in leaves}
     root, offsets = 100.0 * to_file(fk.xpos[:, char.root]), 100.0 * to_file(offsets)
     try:
-        write(path, names, parents, offsets, 1.0 / rate, root, local, leaves)
+        write(path, [called[b] for b in bodies], parents, offsets, 1.0 / rate, root, local, ends, moving=moving)
     except OSError as e:
         raise UserError(f"cannot write {path}: {e.strerror or e}; give a folder that exists and is writable") from None
     except BvhError as e:
         raise UserError(str(e)) from None
 
 
+@dataclass
+class BvhFlags:
+    """The flags of every command that writes BVH."""
+
+    bvh: str | None = arg(None, "write what the character does as BVH: a whole motion, up to ten minutes of a stream")
+    bvh_names: str = arg(
+        OWN,
+        "names of the BVH's joints: the character's own, or a standard's, with a T-pose as rest pose",
+        choices=(OWN, *humanoid.NAMES),
+    )
+
+    def check_bvh(self) -> None:
+        """UserError: names without a file.  Test: tests/test_retarget_bvh.py::test_bvh_names_on_the_command_line"""
+        if self.bvh_names != OWN and not self.bvh:
+            raise UserError(f"--bvh-names {self.bvh_names}: names the joints of --bvh OUT; give that, too")
+
+    def write_bvh(self, char: Character, qpos, rate) -> None:
+        """The file that the flags ask for, and a line on what the standard misses in it.
+
+        Test      tests/test_retarget_bvh.py::test_bvh_names_on_the_command_line"""
+        write_bvh(self.bvh, char, qpos, rate, self.bvh_names)
+        misses = humanoid.lacking(char, self.bvh_names) if self.bvh_names != OWN else ()
+        print(self.bvh + (f": {self.bvh_names} also wants {', '.join(misses)}" if misses else ""))
+
+
 # ------------------------------------------------------------------------------------ command line
 
 
 @dataclass
-class Options(MotionFlags, character.Switches):
+class Options(MotionFlags, BvhFlags, character.Switches):
     """What `python retarget.py` can be told."""
 
     png: str | None = arg(None, "write a contact sheet of the first clip, human and character side by side")
     camera: str = arg("track", "camera of the pictures: track, side, front, or another of the model's")
     video: str | None = arg(None, "write a video of the first clip (.mp4; needs the extra `view`)")
-    bvh: str | None = arg(None, "write the character's kinematic pose in the first clip as BVH")
 
 
 def draw(char: Character, clip: Clip, pose: Pose, frames, size=(480, 360), camera="track", beside=None):
@@ -503,6 +544,7 @@ def main(argv=None):
 
     Test      tests/test_retarget.py::test_command_line"""
     opt = cli(Options, argv, "retarget.py", __doc__)
+    opt.check_bvh()
     check_folders(opt.bvh, opt.png, opt.video, read=mocap.data.parts(opt.motion))
     char = opt.load()
     clips = load(opt.motion, clips=opt.clips, reading=Reading.of(opt))
@@ -531,8 +573,7 @@ def main(argv=None):
         )
     clip, pose = clips[0], retarget(char, clips[0])
     if opt.bvh:
-        write_bvh(opt.bvh, char, pose.qpos, clip.rate)
-        print(opt.bvh)
+        opt.write_bvh(char, pose.qpos, clip.rate)
     if opt.png or opt.video:
         from plumbing import render
 

@@ -431,7 +431,9 @@ def _rotate(q, v):
 # ---------------------------------------------------------------- writing
 
 
-def write(path, names, parents, offsets, frame_time, root_positions, rotations, end_sites=None, order="ZXY"):
+def write(
+    path, names, parents, offsets, frame_time, root_positions, rotations, end_sites=None, order="ZXY", moving=None
+):  # fmt: skip
     """Write local transforms as a BVH: six channels on the root, three rotations on every other joint.
 
     Format    positions replace the root's OFFSET; give the root a zero OFFSET and readers that add it agree too. Joints
@@ -446,16 +448,19 @@ def write(path, names, parents, offsets, frame_time, root_positions, rotations, 
               rotations : (T, J, 4) quaternions w, x, y, z, child -> parent, any length but zero
               end_sites : joint name -> (3,) offset, or None
               order : axes of the rotation channels, a permutation of "XYZ", applied as in the module's docstring
+              moving : joint name -> (T, 3) positions in the parent, of joints that have six channels like the root
     Raises    BvhError: a shape, a name, a parent, a value or the order does not fit; nothing is written
-    Test      tests/mocap/test_bvh.py::test_round_trip
+    Test      tests/mocap/test_bvh.py::test_round_trip, ::test_joints_that_move
     """
-    path, names, end_sites = os.fspath(path), list(names), dict(end_sites or {})
+    path, names, end_sites, moving = os.fspath(path), list(names), dict(end_sites or {}), dict(moving or {})
     parents, rotations = np.asarray(parents), np.asarray(rotations, np.float64)
     J, T = len(names), len(rotations)
-    _check_writable(path, names, parents, frame_time, rotations, end_sites, order)
+    _check_writable(path, names, parents, frame_time, rotations, end_sites, order, moving)
     root_positions = _checked(path, "root_positions", root_positions, (T, 3))
     offsets = _checked(path, "offsets", offsets, (J, 3))
     end_sites = {name: _checked(path, f"the End Site of {_show(name)}", v, (3,)) for name, v in end_sites.items()}
+    moving = {name: _checked(path, f"positions of {_show(name)}", v, (T, 3)) for name, v in moving.items()}
+    moving[names[0]] = root_positions
 
     children = [[] for _ in names]
     for j in range(1, J):
@@ -470,7 +475,7 @@ def write(path, names, parents, offsets, frame_time, root_positions, rotations, 
             lines.append(tab + "}")
             continue
         depth_first.append(j)
-        channels = rotation_channels if j else "Xposition Yposition Zposition " + rotation_channels
+        channels = ("Xposition Yposition Zposition " if names[j] in moving else "") + rotation_channels
         lines += [f"{tab}{'JOINT' if j else 'ROOT'} {names[j]}", tab + "{", f"{tab}\tOFFSET {_row(offsets[j])}"]
         lines.append(f"{tab}\tCHANNELS {len(channels.split())} {channels}")
         if names[j] in end_sites or not children[j]:
@@ -480,7 +485,11 @@ def write(path, names, parents, offsets, frame_time, root_positions, rotations, 
         stack += [(child, depth + 1) for child in reversed(children[j])]
 
     angles = _euler_degrees(rotations[:, depth_first], order)
-    rows = np.concatenate([root_positions, angles.reshape(T, 3 * J)], axis=1)
+    columns = []
+    for k, j in enumerate(depth_first):
+        columns += [moving[names[j]]] if names[j] in moving else []
+        columns.append(angles[:, k])
+    rows = np.concatenate(columns, axis=1)
     lines += ["MOTION", f"Frames: {T}", f"Frame Time: {float(frame_time)!r}"]
     lines += [_row(row) for row in rows]
     temporary = f"{path}.{os.getpid()}.tmp"
@@ -509,7 +518,7 @@ def _checked(path, what, value, shape):
     return value
 
 
-def _check_writable(path, names, parents, frame_time, rotations, end_sites, order):
+def _check_writable(path, names, parents, frame_time, rotations, end_sites, order, moving):
     J, T = len(names), len(rotations)
     for j, name in enumerate(names):
         if not isinstance(name, str) or not re.fullmatch(r"[^\s{}]+", name):
@@ -530,9 +539,10 @@ def _check_writable(path, names, parents, frame_time, rotations, end_sites, orde
         _fail(path, f"zero quaternion at frame {zero[0, 0]}, joint {names[zero[0, 1]]!r}; expected a unit quaternion")
     if sorted(order) != list("XYZ"):
         _fail(path, f"order {order!r}; expected a permutation of 'XYZ'")
-    unknown = [name for name in end_sites if name not in names]
-    if unknown:
-        _fail(path, f"End Site for {unknown[0]!r}, which is no joint; valid: {listed(names)}")
+    for what, given in (("End Site", end_sites), ("positions", moving)):
+        unknown = [name for name in given if name not in names]
+        if unknown:
+            _fail(path, f"{what} for {unknown[0]!r}, which is no joint; valid: {listed(names)}")
 
 
 def _euler_degrees(q, order):

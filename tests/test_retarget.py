@@ -19,11 +19,10 @@ from human import (
     contacts,
     headset_height,
     quat_about,
-    quat_angle,
     resample,
     sensors,
 )
-from mocap import augment, bvh, data, gait
+from mocap import augment, data, gait
 from plumbing import render
 from plumbing.cli import UserError
 
@@ -684,64 +683,3 @@ def test_draw(char, clips):
     pose = retarget.retarget(char, clips[0])
     (image,) = retarget.draw(char, clips[0], pose, [10], (160, 120))
     assert image.shape == (120, 160, 3) and image.dtype == np.uint8 and image.std() > 10
-
-
-# ------------------------------------------------------------------------------------ export
-
-
-def exported(path, seconds=3.0):
-    """A walk's kinematic pose written as BVH.  -> character, pose, clip"""
-    char, clip = character.load("jesse"), clip_of("walk", seconds, turn_rate=0.5)
-    pose = retarget.retarget(char, clip)
-    retarget.write_bvh(path, char, pose.qpos, clip.rate)
-    return char, pose, clip
-
-
-def test_bvh_round_trip(tmp_path):
-    """Our reader's kinematics of the file are MuJoCo's of the motion: 1e-4 m, 1e-4 degrees."""
-    char, pose, clip = exported(tmp_path / "walk.bvh")
-    b, fk = bvh.read(tmp_path / "walk.bvh"), retarget.forward_kinematics(char, pose.qpos)
-    pos, quat = bvh.global_pose(b)
-    bodies = [char.model.body(n).id for n in b.names]
-    assert len(bodies) == char.model.nbody - 1 and b.frame_time == pytest.approx(1 / clip.rate)
-    to_file = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # x left, y up, z forward
-    np.testing.assert_allclose(pos / 100, fk.xpos[:, bodies] @ to_file.T, atol=1e-6)
-    turn = Rotation.from_matrix(to_file)
-    want = turn * Rotation.from_quat(fk.xquat[:, bodies].reshape(-1, 4), scalar_first=True) * turn.inv()
-    got = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True)
-    assert np.degrees((got * want.inv()).magnitude()).max() < 1e-4
-    assert set(b.end_sites) == {n for j, n in enumerate(b.names) if j not in b.parents}
-    assert all(np.linalg.norm(v) > 1.0 for v in b.end_sites.values())  # cm: importers drop bones without length
-    assert not b.offsets[0].any()  # adding the root's OFFSET or not is the same
-
-
-def test_bvh_is_a_human_again(tmp_path, capsys):
-    """The character's own file, read as a human of an unknown rig."""
-    char, pose, clip = exported(tmp_path / "walk.bvh")
-    got = data.from_bvh(tmp_path / "walk.bvh")
-    assert "unit cm" in capsys.readouterr().err
-    for s in ("thigh_l", "shin_r", "upper_arm_l", "forearm_r", "pelvis"):
-        assert np.degrees(quat_angle(got.quat, clip.quat))[:, SEG[s]].mean() < 8, s
-
-
-def test_bvh_in_another_library(tmp_path):
-    """bvhsdk reads the same positions."""
-    sdk = pytest.importorskip("bvhsdk")
-    char, pose, _ = exported(tmp_path / "walk.bvh", 0.5)
-    fk, other = retarget.forward_kinematics(char, pose.qpos), sdk.ReadFile(str(tmp_path / "walk.bvh"))
-    assert other.frames == len(pose.qpos)
-    for joint in other.getlistofjoints():
-        for t in (0, 7, len(pose.qpos) - 1):
-            want = 100 * fk.xpos[t, char.model.body(joint.name).id][[1, 2, 0]]
-            np.testing.assert_allclose(joint.getPosition(t), want, atol=1e-4)
-
-
-def test_bvh_refuses(tmp_path):
-    char, clip = character.load("jesse"), clip_of("walk", 0.2)
-    pose = retarget.retarget(char, clip)
-    with pytest.raises(UserError, match="cannot write"):
-        retarget.write_bvh(tmp_path / "nowhere" / "a.bvh", char, pose.qpos, clip.rate)
-    char.model.jnt_pos[5] = [0.0, 0.0, 0.1]
-    with pytest.raises(UserError, match="lies beside the body's origin"):
-        retarget.write_bvh(tmp_path / "a.bvh", char, pose.qpos, clip.rate)
-    assert not list(tmp_path.iterdir())

@@ -56,6 +56,7 @@ from human import (
     quat_rotate,
     sensors,
 )
+from mocap import bvh
 from mocap.data import load
 from plumbing.cli import UserError, run_main
 from plumbing.runs import save_checkpoint
@@ -896,6 +897,21 @@ def test_command_line(jesse, tmp_path, capsys):
     (tmp_path / "s.csv").write_text("".join(lines_in_our_axes(0.5)))
     assert run(*base, "--axes", "mujoco") == 2
     assert "45 rows show the headset for 0.49 s; calibration needs 1.0 s" in capsys.readouterr().err
+
+
+def test_stream_as_bvh(jesse, tmp_path, capsys):
+    """What the character did under a headset, by another tool's names; not of a folder."""
+    policy = tiny_policy(jesse, tmp_path / "p.npz")
+    (tmp_path / "s.csv").write_text("".join(lines_in_our_axes(4)))
+    base = ("--character", "jesse", "--policy", policy, "--axes", "mujoco", "--bvh", tmp_path / "out.bvh")
+    assert run(*base, "--stream", tmp_path / "s.csv", "--seconds", 2, "--bvh-names", "mixamo") == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "out.bvh")
+    file = bvh.read(tmp_path / "out.bvh")
+    assert len(file.values) == 60 and file.names[0] == "mixamorig:Hips" and "mixamorig:LeftForeArm" in file.names
+    first = bvh.local(file)[0][0, 0] / 100  # the root's place: x left, y up, z forward
+    assert first[1] == pytest.approx(jesse.hip_height, abs=0.1) and np.abs(first[[0, 2]]).max() < 0.4
+    assert run(*base, "--stream", tmp_path) == 2
+    assert "is a folder, played side by side: leave out pictures, --bvh" in capsys.readouterr().err
 
 
 def test_stdin(jesse, tmp_path, capsys, monkeypatch):

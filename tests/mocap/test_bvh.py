@@ -288,6 +288,26 @@ def test_round_trip(tmp_path_factory, seed, J, T, order):
     assert not list(path.parent.glob("*.tmp"))
 
 
+def test_joints_that_move(tmp_path):
+    """Six channels on a joint whose origin moves in its parent; its column order follows the hierarchy's."""
+    rng = np.random.default_rng(5)
+    names, parents, T = ["a", "b", "c", "d"], np.array([-1, 0, 0, 1]), 4
+    q = Rotation.random(T * 4, random_state=6).as_quat(scalar_first=True).reshape(T, 4, 4)
+    root, offsets, place = rng.normal(0, 50, (T, 3)), rng.normal(0, 9, (4, 3)), rng.normal(0, 9, (T, 3))
+    bvh.write(tmp_path / "a.bvh", names, parents, offsets, 1 / 30, root, q, moving={"c": place})
+    clip = bvh.read(tmp_path / "a.bvh")
+    assert clip.names == ("a", "b", "d", "c") and [len(c) for c in clip.channels] == [6, 3, 3, 6]
+    positions, rotations = bvh.local(clip)
+    np.testing.assert_allclose(positions[:, 3], place, atol=1e-6)
+    np.testing.assert_allclose(positions[:, 0], root, atol=1e-6)
+    np.testing.assert_allclose(positions[:, 2], np.tile(offsets[3], (T, 1)), atol=1e-6)
+    assert angle_deg(rotations[:, [0, 1, 3, 2]], q).max() < 1e-4
+    with pytest.raises(bvh.BvhError, match="positions for 'x', which is no joint"):
+        bvh.write(tmp_path / "b.bvh", names, parents, offsets, 1 / 30, root, q, moving={"x": place})
+    with pytest.raises(bvh.BvhError, match="positions of 'c' has shape"):
+        bvh.write(tmp_path / "b.bvh", names, parents, offsets, 1 / 30, root, q, moving={"c": place[:2]})
+
+
 def slow_pose_of(parents, offsets, root, q):
     out = np.zeros((*q.shape[:2], 3))
     for t in range(len(q)):
