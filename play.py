@@ -500,6 +500,16 @@ def line_of(name, ends, row) -> str:
 # ------------------------------------------------------------------------------------ command line
 
 
+def check_source(opt: StreamFlags, argv) -> None:
+    """UserError: flags of a motion beside a stream, or of a stream without one.
+
+    Test      tests/robustness/test_cli.py::test_play_flags_that_would_do_nothing"""
+    if wrong := given_flags(argv) & (OF_MOTION if opt.stream else OF_STREAM):
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(wrong))
+        says = "are of a motion, and --stream has none" if opt.stream else "are of --stream FILE"
+        raise UserError(f"{flags} {says}: leave out the one or the other")
+
+
 def check_options(opt: Options, argv) -> None:
     """UserError: flags that do not go together.
 
@@ -513,10 +523,7 @@ def check_options(opt: Options, argv) -> None:
         plain, others = Options(), "policy character tail scale set stream view video bvh push".split()
         if wrong := [f"--{k}" for k in others if getattr(opt, k) != getattr(plain, k)]:
             raise UserError(f"--compare takes policies with their own characters: leave out {', '.join(wrong)}")
-    if wrong := given_flags(argv) & (OF_MOTION if opt.stream else OF_STREAM):
-        flags = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(wrong))
-        says = "are of a motion, and --stream has none" if opt.stream else "are of --stream FILE"
-        raise UserError(f"{flags} {says}: leave out the one or the other")
+    check_source(opt, argv)
     opt.check_bvh()
     if opt.stream and opt.measure:
         raise UserError("--measure compares with a human's motion, which a stream has not; give one of the two")
