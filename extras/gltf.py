@@ -315,6 +315,8 @@ def recorded(char: Character, policy, path, meta, opt: Options):
             return len(seen) < play.KEPT * CONTROL_RATE
 
         play.follow(char, policy, path, devices_of(meta, path, opt.sensors), opt, see)
+        if not seen:
+            raise UserError(f"{opt.stream}: ends with the second that calibrates; give a longer one")
         return np.stack(seen)
     ref = play.sequence_of(char, opt)
     seen = shown_to(meta, path, ref, opt.sensors)

@@ -191,6 +191,7 @@ def test_command_line(tmp_path, capsys, monkeypatch):
     still = "0,1.6,0,0,0,0,1,-0.25,0.8,0.1,0,0,0,1,0.25,0.8,0.1,0,0,0,1"
     rows += [f"{k / 60},{still}" for k in range(150)]
     (tmp_path / "s.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "short.csv").write_text("\n".join(rows[:62]) + "\n")
     gltf.main(["--stream", "s.csv", "--axes", "unity", "--seconds", "0.5", "--out", "s.glb"])
     out = capsys.readouterr().out
     assert "0.5 s played" in out and "s.glb: 19 bodies, 0.5 s" in out
@@ -204,12 +205,13 @@ def test_command_line(tmp_path, capsys, monkeypatch):
         (["--axes", "unity"], "--axes are of --stream FILE"),
         (["--stream", "nothing.csv"], "nothing.csv"),
         (["--stream", str(tmp_path)], "is a folder"),
+        (["--stream", "short.csv", "--axes", "unity"], "short.csv: ends with the second that calibrates"),
         (["--character", "nobody"], "no character 'nobody'"),
         (["--sequence", "99", "--clips", "walk_005"], "--sequence 99: there are 1"),
     ):
         with pytest.raises(UserError, match=says):
             gltf.main(args)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["oppy.glb", "s.csv", "s.glb"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["oppy.glb", "s.csv", "s.glb", "short.csv"]
 
 
 def test_without_the_library(monkeypatch):
