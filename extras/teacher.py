@@ -39,8 +39,8 @@ from plumbing.cli import POSITIVE, UserError, arg, run_main
 from plumbing.training import progress_line, read_options
 from policy import load_policy, widths
 
-RATE, DAMPING = 10.0, 0.7  # rad/s and of critical damping, ASSUMED: of the teacher's arms, spring included
-FARTHEST = 0.5  # rad, ASSUMED: an arm farther off is pulled no harder
+RATE, DAMPING = 6.0, 0.7  # rad/s and of critical damping, ASSUMED: of the teacher's arms, spring included
+FARTHEST, FASTEST = 0.5, 6.0  # rad, rad/s, ASSUMED: an arm farther off is pulled no harder, none is asked for more
 
 
 @dataclass
@@ -77,10 +77,12 @@ def inertia(char: Character) -> np.ndarray:
 class Teacher:
     r"""Torques that bring driven joints to the kinematic pose, as actions.
 
-    Equation  τ = c + k (q* − q_spring) + (I ω² − k) clip(q* − q) − (2 ζ I ω − d) q̇,   a = clip(τ / τ_max, −1, 1)
-    Symbols   c gravity and Coriolis torques; k of the joint's spring, d its damping; I `inertia`; ω RATE; ζ DAMPING;
-              neither bracket below 0; clip at ± FARTHEST
-    Why       spring and damper do their part by themselves, so that together the joint answers as I (ω², 2ζω)
+    Equation  τ = c + k (q* − q_spring) + d q̇* + (I ω² − k) clip(q* − q) + (2 ζ I ω − d) (q̇* − q̇)
+              a = clip(τ / τ_max, −1, 1)
+    Symbols   q*, q̇* of the next frame; c gravity and Coriolis torques; k of the joint's spring, d its damping; I
+              `inertia`; ω RATE; ζ DAMPING; neither bracket below 0; q* − q within FARTHEST, q̇* within FASTEST
+    Why       spring and damper do their part by themselves, so that together the joint answers as I (ω², 2ζω); much
+              stiffer, an arm that is bent, and so lighter, would shake at 30 torques a second
     Test      tests/extras/test_teacher.py::test_teacher_holds_an_arm
     """
 
@@ -90,15 +92,18 @@ class Teacher:
         i = inertia(char)
         self.spring, self.rest = m.jnt_stiffness[dof - 5], m.qpos_spring[dof + 1]
         self.stiffness = np.maximum(i * RATE**2 - self.spring, 0.0)
-        self.damping = np.maximum(2.0 * DAMPING * i * RATE - m.dof_damping[dof], 0.0)
+        self.damper = m.dof_damping[dof]
+        self.damping = np.maximum(2.0 * DAMPING * i * RATE - self.damper, 0.0)
         self.limits = char.limits
 
     def __call__(self):
         """(N, u) of the present states."""
-        env, wanted = self.env, self.env.ref.qpos[self.env.frame][:, 1 + self.dof]
+        env, ref = self.env, self.env.ref
+        f = np.minimum(env.frame + 1, ref.last[env.sequence])
+        wanted, speed = ref.qpos[f][:, 1 + self.dof], np.clip(ref.qvel[f][:, self.dof], -FASTEST, FASTEST)
         error = np.clip(wanted - env.qpos[:, 1 + self.dof], -FARTHEST, FARTHEST)
-        torque = self.bias[:, self.dof] + self.spring * (wanted - self.rest)
-        torque += self.stiffness * error - self.damping * env.qvel[:, self.dof]
+        torque = self.bias[:, self.dof] + self.spring * (wanted - self.rest) + self.damper * speed
+        torque += self.stiffness * error + self.damping * (speed - env.qvel[:, self.dof])
         return np.clip(torque / self.limits, -1.0, 1.0)
 
 

@@ -41,7 +41,8 @@ def test_taught(char):
 
 def test_teacher_holds_an_arm(char, ref):
     """At rest in a raised pose its torque is what MuJoCo's inverse dynamics asks for to stay there.  Beside the pose,
-    or moving, the arm accelerates with ω² and 2ζω, and no harder beyond FARTHEST; the inertia is mj_inverse's, too."""
+    or moving, the arm accelerates with ω² and 2ζω, and no harder beyond FARTHEST and FASTEST; the
+    inertia is mj_inverse's, too."""
     arms = teacher.taught(char, ("shoulder",))
     q, v = 7 + char.driven[arms], 6 + char.driven[arms]
     raised = 0.3 * np.sign(char.model.jnt_range[v - 5].sum(axis=1))
@@ -69,6 +70,11 @@ def test_teacher_holds_an_arm(char, ref):
     slowed = (act()[1, arms] * char.limits[arms] - torque[0]) / -0.01
     critical = 2 * teacher.DAMPING * at * teacher.RATE - m.dof_damping[v]
     np.testing.assert_allclose(slowed, np.maximum(critical, 0.0), atol=2e-3)
+
+    for asked, given in ((0.5, 0.5), (99.0, teacher.FASTEST)):  # a pose that moves: dampers are helped, and it is met
+        env.ref.qvel[:, v] = asked
+        ahead = act()[0, arms] * char.limits[arms] - torque[0]
+        np.testing.assert_allclose(ahead, given * (m.dof_damping[v] + np.maximum(critical, 0.0)), atol=1e-6)
 
     data.qpos[:2], data.qpos[3:7], data.qpos[7:] = 0.0, char.rest[char.root], char.default
     mujoco.mj_inverse(m, data)
@@ -108,7 +114,7 @@ def test_student_copies(start, tmp_path):
     run(tmp_path / "a", 50, "--init", str(start), "--epochs", "4", "--teacher-lr", "0.003")
     rows = [row.split(",") for row in (tmp_path / "a" / "metrics.csv").read_text().splitlines()]
     taught, kept = (np.array([float(r[rows[0].index(name)]) for r in rows[1:]]) for name in ("taught_rms", "kept_rms"))
-    assert taught[-10:].mean() < 0.7 * taught[:3].mean() and kept[-10:].mean() < 0.1
+    assert taught[-10:].mean() < 0.85 * taught[:3].mean() and kept[-10:].mean() < 0.1
     old, new = load_policy(start)[0], load_policy(tmp_path / "a")[0]
     assert np.array_equal(old.norm.mean, new.norm.mean) and np.array_equal(old.log_std, new.log_std)
     train.main([*TINY, "--init", str(tmp_path / "a"), "--out", str(tmp_path / "b"), "--steps", "64"])
