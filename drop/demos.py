@@ -268,7 +268,7 @@ def push(stage, rng):
                     continue
                 sim, state = stage.start(speed)
                 left = quat_rotate(quat_about(2, heading(state.quat[0])), np.array([0.0, 1.0, 0.0]))
-                act = _pushing(joint, newton * left)
+                act = pushing(joint, newton * left)
                 take = single(f"{word} {where} {size} {newton:.0f} N", sim, state, 180, stage.again(), act)
                 take.window = (30, 94)
                 take.notes["away from the unpushed take"] = _displacement(take, undisturbed)
@@ -288,7 +288,8 @@ def _displacement(take, undisturbed):
     return f"{away[PUSH_FRAMES[1] - 1]:.1f} cm when the push ends, {later:.1f} 1 s later"
 
 
-def _pushing(joint, vector, frames=PUSH_FRAMES):
+def pushing(joint, vector, frames=PUSH_FRAMES):
+    """What `single` does in every frame: a constant force on a joint in those of `frames`.  vector (3,) [N]"""
     def act(t, state):
         return (one_force(joint, vector) if frames[0] <= t < frames[1] else None), {}, ()
 
@@ -607,7 +608,7 @@ def backflip(stage, rng):
     after = stage.general or ClipPrior(x, quat, first)
     sim, _ = stage.start(0.0, prior=SwitchPrior(ClipPrior(x, quat, first), after, onset))
     state = sim.begin(x[first], quat[first], (x[first] - x[first - 1]) / STEP)
-    act = _pushing("spine3", np.array([0.0, 60.0, 0.0]), (onset, onset + 8))
+    act = pushing("spine3", np.array([0.0, 60.0, 0.0]), (onset, onset + 8))
     take = single(f"backflip {name}", sim, state, onset + 90, rng, act)
     return [take]
 
@@ -688,7 +689,7 @@ def wrench(stage, rng):
         sim, state = stage.start(2.5)
         sim.correction = correction
         undisturbed = _centres(single("", sim, state, 120, stage.again(), lambda t, state: (None, {}, ())))
-        act = _pushing("spine3", np.array([0.0, 120.0, 0.0]))
+        act = pushing("spine3", np.array([0.0, 120.0, 0.0]))
         take = single(f"run pushed {'' if correction else 'un'}corrected", sim, state, 120, stage.again(), act)
         take.window = (30, 94)
         pd, left = (np.array([getattr(o[0], n) for o in take.outcomes]) for n in ("wrench_pd", "wrench"))
@@ -720,7 +721,7 @@ def weights(stage, rng):
         sim, state = stage.start(1.2, weights=w)
         left = quat_rotate(quat_about(2, heading(state.quat[0])), np.array([0.0, 100.0, 0.0]))
         torso, hand, free = (single("", sim, state, 18, stage.again(), act) for act in (
-            _pushing("spine3", left, (10, 18)), _pushing("wrist_l", left, (10, 18)), nothing))  # fmt: skip
+            pushing("spine3", left, (10, 18)), pushing("wrist_l", left, (10, 18)), nothing))  # fmt: skip
         bone = max(o[0].bone_error for o in torso.outcomes)
         moved = np.linalg.norm((hand.states[-1][0].x - free.states[-1][0].x)[J["wrist_l"]])
         (angle, _), (_, alone) = forearm(w), forearm(w, restore=False)
@@ -872,7 +873,7 @@ def check_outputs(opt):
         if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
             raise UserError(f"cannot write {path}: give a file in a folder that exists and is writable")
     if opt.video:
-        render._extra("imageio")
+        render.extra("imageio")
 
 
 def main(argv, others=()):

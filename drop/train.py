@@ -472,7 +472,7 @@ def detection(limit, recording, rng, n=500):
         C = C0.copy()
         if change is not None:
             joint, axis, degrees = body.J[change[0]], np.array(change[1], float), np.radians(change[2])
-            below = vae._ANCESTORS[:, joint] > 0
+            below = vae.ANCESTORS[:, joint] > 0
             parent = C0[:, body.PARENTS[joint]]
             rest = np.matmul(C0[:, below], np.swapaxes(C0[:, [joint]], -1, -2))  # descendants relative to the joint
             straight = vae.rotate_rows(np.eye(3), degrees * axis)  # the joint's turn as rows, Lᵀ of R = R_parent L

@@ -224,7 +224,7 @@ def clips_of(opt: Options) -> list:
     for each in data.parts(opt.motion):  # as `data.sequences`, but the single clips are wanted, too, and read once
         say(f"reading {each}")
         found = data.load(each, clips=opt.clips, split="train", reading=reading)
-        made = found if len(found) == 1 else data._sequences(found, f"{each} [train]", opt.seed)
+        made = data.stitched(found, f"{each} [train]", opt.seed)
         single, clips, once = single + found, clips + made, set(map(id, found))
         runs += [c for c in made if id(c) not in once and augment.fastest_second(c) > RUNS]
     if opt.augment:

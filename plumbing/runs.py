@@ -33,7 +33,7 @@ from pathlib import Path
 import numpy as np
 
 from plumbing.cli import UserError
-from plumbing.files import _twice, atomic_write, parse_json, parse_number, read_arrays, read_text
+from plumbing.files import atomic_write, parse_json, parse_number, read_arrays, read_text, twice
 
 CHECKPOINT, PREVIOUS, CONFIG, METRICS = "checkpoint.npz", "checkpoint.prev.npz", "config.json", "metrics.csv"
 
@@ -372,7 +372,7 @@ def read_metrics(path):
     header, rows = (lines[0], lines[1:]) if lines else ([], [])
     columns = {name: np.empty(len(rows)) for name in header}
     if len(columns) < len(header):
-        raise UserError(f"{path} line 1: column {_twice(header)[:40]!r} is there twice; valid: once each")
+        raise UserError(f"{path} line 1: column {twice(header)[:40]!r} is there twice; valid: once each")
     for i, row in enumerate(rows):
         for name, cell in zip(header, row, strict=True):
             try:

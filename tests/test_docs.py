@@ -479,6 +479,26 @@ def test_imports_run_one_way(capsys):
     assert not bad, "\n".join(bad)
 
 
+def private_names_of(path: Path):
+    """(line, name) of every name with an underscore that a file takes from another module of ours."""
+    ours, modules = {m.split(".")[0] for m in MODULES}, {}
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.Import):
+            modules |= {a.asname or a.name: a.name for a in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in ours:
+            modules |= {a.asname or a.name: a.name for a in node.names}
+            yield from ((node.lineno, a.name) for a in node.names if re.match(r"_(?!_)", a.name))
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.Attribute) and re.match(r"_(?!_)", node.attr) and ast.unparse(node.value) in modules:
+            yield node.lineno, ast.unparse(node)
+
+
+def test_private_names_stay_at_home():
+    """A name that begins with an underscore is used in its own file alone."""
+    bad = [f"{p.relative_to(ROOT)}:{line}: {name}" for p in FILES for line, name in private_names_of(p)]
+    assert not bad, "\n".join(bad)
+
+
 def test_no_circles():
     """Between files, whatever the wing."""
     edges = {m: {n for _, n in imports_of(p) if n in PATHS and n != m} for m, p in PATHS.items()}

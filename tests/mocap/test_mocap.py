@@ -482,13 +482,13 @@ def pieces(seed=0, n=12, body="a"):
 @pytest.fixture
 def parts_of(monkeypatch):
     """What stitch joins: a list of (clip, first frame, last frame) for each sequence, filled as it runs."""
-    seen, join = [], stitch._join
+    seen, join = [], stitch.join
 
     def spy(parts, blend, name):
         seen.append(parts)
         return join(parts, blend, name)
 
-    monkeypatch.setattr(stitch, "_join", spy)
+    monkeypatch.setattr(stitch, "join", spy)
     return seen
 
 
@@ -833,7 +833,7 @@ def test_inspect(tmp_path, capsys):
     assert " 0 footfalls  balls - cm up" in inspect.describe(data.replace(clip, pos=clip.pos + 1, ball=clip.ball + 1))
     inspect.main(["inspect", str(tmp_path)])
     out = capsys.readouterr().out
-    assert "walk_001" in out and " 30.0 Hz" in out and "single clips are used" in out
+    assert "walk_001" in out and " 30.0 Hz" in out and "one clip, 1.0 s, as it is" in out
     with pytest.raises(UserError, match="nowhere"):
         inspect.main(["inspect", str(tmp_path / "nowhere")])
 
