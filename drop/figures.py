@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drop import body, demos, simulator
+from drop import body, demos, momenta, pictures, simulator
 from drop.body import GRAVITY, PARENTS, STANDING, STEP, N
 from drop.simulator import Plane, Simulator
 from human import quat_angle
@@ -198,7 +198,7 @@ def draw(opt, stage, found, medians):
     name, x, quat = demos.pick_motion(stage.clips, 2.5)
     n = min(len(x), 122)
     for cylinders, label in ((False, "points"), (True, "cylinders")):
-        panels[3].plot(demos.root_wrench(x[:n], quat[:n], cylinders), label=f"{name}, {label}")
+        panels[3].plot(momenta.root_wrench(x[:n], quat[:n], cylinders), label=f"{name}, {label}")
     for correction, label in ((False, "solved"), (True, "corrected")):
         sim, state = stage.start(2.5)
         sim.correction = correction
@@ -373,4 +373,4 @@ def main(argv):
     for take in takes or ():
         print(demos.report(take))
     if takes and (opt.png or opt.video):
-        demos.write_pictures(takes, opt)
+        pictures.write_pictures(takes, opt)
