@@ -427,6 +427,72 @@ class Progress:
         print(self.line(done, values), file=self.stream or sys.stdout, flush=True)
 
 
+class Means:
+    """Means of the numbers that have come since the last line.
+
+    Test      tests/plumbing/test_runs.py::test_means"""
+
+    def __init__(self):
+        self.sums, self.count = {}, 0
+
+    def add(self, values):
+        """One more of each, a dict of name -> number; a name may be missing now and then."""
+        for name, value in values.items():
+            self.sums[name] = self.sums.get(name, 0.0) + value
+        self.count += 1
+
+    def take(self):
+        """name -> mean over all that were added; then it begins anew."""
+        means = {name: total / self.count for name, total in self.sums.items()}
+        self.sums, self.count = {}, 0
+        return means
+
+
+class Journal:
+    """What stands around a training loop: the run's folder, metrics.csv, progress, checkpoints, Ctrl-C.
+
+        with Journal(…) as journal:
+            while steps < total and not journal.stop:
+                …
+                journal.write(steps, row, line)
+
+    Args      out, config, resume : as `open_run`; rows : of the checkpoint that is continued, or None
+              save : function of the number of rows, writes a checkpoint: after a line where the last one is `seconds`
+                  old, and at the end unless an exception is the end
+    Test      tests/plumbing/test_runs.py::test_journal
+    """
+
+    def __init__(self, out, config, resume, rows, progress: Progress, save, seconds):
+        self.metrics = Metrics(open_run(out, config, resume) / METRICS, rows)
+        self.progress, self.save, self.seconds = progress, save, seconds
+        self.flag, self.saved = StopFlag(), time.monotonic()
+
+    @property
+    def stop(self):
+        """Has a signal asked for the end?"""
+        return self.flag.stop
+
+    def __enter__(self):
+        self.flag.__enter__()
+        return self
+
+    def write(self, done, row, line):
+        """One row of metrics.csv, one line of progress, and a checkpoint if it is time."""
+        self.metrics.append(row)
+        self.progress.update(done, line)
+        if time.monotonic() - self.saved >= self.seconds:
+            self.save(self.metrics.rows)
+            self.saved = time.monotonic()
+
+    def __exit__(self, error, *_):
+        try:
+            if error is None:
+                self.save(self.metrics.rows)
+        finally:
+            self.flag.__exit__()
+            self.metrics.close()
+
+
 def fmt_time(seconds):
     """Seconds as 42s, 3m07s, 2h05m or 1d03h."""
     s = max(round(seconds), 0)
