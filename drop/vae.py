@@ -263,7 +263,7 @@ class LatentMLP(MLP):
             self.shapes[f"W{i}"], self.shapes[f"b{i}"] = (n_in + latent, n_out), (n_out,)
         self.n_params = sum(math.prod(s) for s in self.shapes.values())
         self.theta = np.zeros(self.n_params, dtype=dtype)
-        for i in range(self.n_layers):
+        for i in range(self.n_layers if rng else 0):  # as MLP: without rng zero, for weights that are read
             g = gain if i == self.n_layers - 1 else NN_ACTIVATIONS[self.activation][2]
             self.params[f"W{i}"][:] = orthogonal(*self.shapes[f"W{i}"], g, rng)
 

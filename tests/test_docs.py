@@ -206,6 +206,13 @@ def test_named_tests_exist():
     assert names and not bad, "\n".join(bad)
 
 
+def test_every_equations_test_is_named():
+    """tests/test_equations.py is to be read beside the paper: part 1 leads to each of its tests."""
+    named = {n for row in rows(1, "") for n in quoted(row[3])}
+    missing = [t for t in sorted(functions_in("test_equations.py")) if f"tests/test_equations.py::{t}" not in named]
+    assert not missing, f"REPRODUCE.md, part 1 does not name {missing}"
+
+
 # ------------------------------------------------------------------------------------ part 2
 
 

@@ -409,10 +409,10 @@ def test_outputs_are_checked_first(monkeypatch, tmp_path):
             demos.main(["push", flag, str(path)])
 
 
-def test_command(monkeypatch, capsys, tmp_path):
+def test_command(stage, monkeypatch, capsys, tmp_path):
     """python -m drop DEMO: help, numbers, pictures, and one line for whatever is wrong."""
-    monkeypatch.setattr(demos, "BUILTIN", SHORT)
-    cut(monkeypatch, 12)
+    monkeypatch.setattr(demos, "motions", lambda opt: [(name, x[:130], q[:130]) for name, x, q in stage.clips])
+    cut(monkeypatch, 10)
 
     def run(*args):
         with pytest.raises(SystemExit) as end:
