@@ -407,7 +407,9 @@ def run(trainer: Trainer, loaded=None, before=0):
 
 def make_env(opt: Options) -> Env:
     """The character, and the motions retargeted to it.  Test: tests/test_ppo.py::test_switches_reach_the_environment"""
-    char = ablated(opt.load(), opt.without, opt.track).solved_by(SOLVER)
+    whole = opt.load()
+    training.say_idle(whole, {name: WITHOUT[name] for name in opt.without})
+    char = ablated(whole, opt.without, opt.track).solved_by(SOLVER)
     clips = data.sequences(opt.motion, "train", opt.clips, seed=opt.seed, reading=Reading.of(opt))
     ref = retarget.reference(char, clips)
     shown = headset_only(ref) if opt.sensors == "hmd" else ref

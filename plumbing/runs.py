@@ -92,8 +92,8 @@ def git_state(folder=None):
 def check_run(out, resume=False):
     """Is a run there where one is to be resumed, and none where one is to start?  Call it before slow work.
 
-    Raises    UserError: a run is there already and resume is False; or none is there and resume is True, or its
-              metrics.csv cannot be continued
+    Raises    UserError: a run is there already and resume is False, or the folder cannot be made; or none is there and
+              resume is True, or its metrics.csv cannot be continued
     Test      tests/plumbing/test_runs.py::test_open_run, tests/robustness/test_fuzz.py::test_run_folders
     """
     out = Path(out)
@@ -104,6 +104,9 @@ def check_run(out, resume=False):
         raise UserError(f"{out} holds no run to resume: leave out --resume, or name a folder that has {CONFIG}")
     if resume and (out / METRICS).exists():
         _whole_lines(out / METRICS)
+    above = next(p for p in (out, *out.absolute().parents) if p.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise UserError(f"cannot create the run folder {out}: {above} is no folder that can be written to")
 
 
 def open_run(out, config, resume=False):

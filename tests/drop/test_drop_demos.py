@@ -343,6 +343,7 @@ def all_clips():
 
 def test_the_tripped_stumble(all_clips, monkeypatch):
     """A walker pitches over the held foot, which it does not if Eq. 14 leaves a fifth of the torque; a runner falls."""
+    cut(monkeypatch, 120)
     leans = []
     for seed in range(3):
         walk = demos._trip(all_clips, np.random.default_rng(seed), 1.2)
