@@ -27,7 +27,7 @@ KEYS = (  # spec: every key of every row
 ).split()
 FIELD = [k for k, *_ in metrics.FIELD]
 GROUPS = [f"spring_share.{g}" for g in ("ankle", "elbow", "head", "hip", "knee", "neck", "shoulder", "spine")]
-KEYS += [*GROUPS]
+KEYS += GROUPS
 
 
 @pytest.fixture(scope="module")
