@@ -535,6 +535,12 @@ def numberless(name: str) -> str:
     return re.sub(r"\d+", "", name)
 
 
+def driven_groups(char: Character) -> dict:
+    """Joint group ("hip", "tail", …) -> indices of its motors.  Test: tests/test_metrics.py::test_spring_share"""
+    names = [numberless(joint_group(char.hinges[h])) for h in char.driven]
+    return {name: np.flatnonzero(np.array(names) == name) for name in sorted(set(names))}
+
+
 def normalised(w):
     """Eq. 11's weights made to sum to 1, so that d is a mean.  ASSUMED: the one place where that is decided.
     With the plain sum over 33 joints and k_q = 25, 0.1 rad everywhere would give e^-8 and no gradient; the mean
@@ -561,3 +567,48 @@ def geom_lowest(model, geoms, xpos, xmat):
     for axis in range(3):
         lowest -= np.abs(xmat[:, geoms, 6 + axis]) * half[:, axis]  # R_zi: height of axis i
     return lowest
+
+
+class OwnShapes:
+    """Which of a character's collision shapes may be in one another's way, and how deep they are in a pose.
+
+    ASSUMED   neighbours, which are left out, are shapes of bodies at most two joints apart, and what overlaps in the
+              default pose, as a belly does with thighs
+    Test      tests/test_metrics.py::test_self_penetration
+    """
+
+    REACH = 0.2  # m beyond which a distance does not matter
+
+    def __init__(self, char: Character):
+        self.model, self.data = char.model, mujoco.MjData(char.model)
+        m = self.model
+        geoms = np.flatnonzero(m.geom_conaffinity)
+        pairs = [(a, b) for i, a in enumerate(geoms) for b in geoms[i + 1 :] if not self._near(*m.geom_bodyid[[a, b]])]
+        self.pairs = np.array(pairs, int).reshape(-1, 2)
+        rest = np.concatenate([[0.0, 0.0, char.hip_height], char.rest[char.root], char.default])
+        self._pose(rest)
+        self.pairs = self.pairs[[self._distance(a, b) > 0 for a, b in self.pairs]]
+
+    def _near(self, a, b):
+        """Are two bodies at most two joints apart in the tree?"""
+        parent = self.model.body_parentid
+        up = [{body, parent[body], parent[parent[body]]} - {0} for body in (a, b)]
+        return a in up[1] or b in up[0] or parent[a] == parent[b] != 0
+
+    def _pose(self, qpos):
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def _distance(self, a, b):
+        return mujoco.mj_geomDistance(self.model, self.data, a, b, self.REACH, None)
+
+    def overlap(self, qpos):
+        """Deepest overlap in each pose.  qpos (T, nq) -> (T,) [m], 0 where nothing overlaps"""
+        out, (a, b) = np.zeros(len(qpos)), self.pairs.T
+        reach = self.model.geom_rbound[a] + self.model.geom_rbound[b]
+        for t, q in enumerate(qpos):
+            self._pose(q)
+            apart = np.linalg.norm(self.data.geom_xpos[a] - self.data.geom_xpos[b], axis=1)
+            near = self.pairs[apart < reach]
+            out[t] = max((-self._distance(i, j) for i, j in near), default=0.0)
+        return np.maximum(out, 0.0)

@@ -399,7 +399,7 @@ class Env:
         if seed is not None:
             self.rng = np.random.default_rng(seed)
         self._reset(np.arange(self.n), frames)
-        self._observe(slice(None))
+        self.observe(slice(None))
         return self.full[:, : self.obs_size], {"critic": self.full}
 
     def _reset(self, ids, frames=None):
@@ -478,7 +478,7 @@ class Env:
         truncated = ends["clip"] | ends["time"]
         reward = total_reward(terms) + np.where(terminated, self.char.reward["fail"], 0.0)
         self.action[:] = a
-        self._observe(slice(None))
+        self.observe(slice(None))
         done = np.flatnonzero(terminated | truncated) if self.autoreset else ()
         info = {"terms": terms, "ends": ends, "_final_obs": terminated | truncated}
         info |= {"length": self.steps.copy(), "available": self.available.copy()}
@@ -487,7 +487,7 @@ class Env:
             info["final_obs"] = info["final_critic"][:, : self.obs_size]
             self.starts.count(self.rng, f[done], terminated[done], self.steps[done])
             self._reset(done)
-            self._observe(done)
+            self.observe(done)
         info["critic"] = self.full
         return self.full[:, : self.obs_size], reward, terminated, truncated, info
 
@@ -538,8 +538,8 @@ class Env:
         links = self.char.reward_links
         return body_velocity(self.cvel.take(links, axis=1), self.xpos.take(links, axis=1), self.com[:, self.char.root])
 
-    def _observe(self, ids):
-        """Fill the rows `ids` of self.full (a slice or indices)."""
+    def observe(self, ids):
+        """Fill the rows `ids` of self.full (a slice or indices).  Test: tests/test_env.py::test_observation_terms"""
         ref, f = self.ref, self.frame[ids]
         s, every = self.slices, isinstance(ids, slice)
         out = self.full if every else np.empty((len(f), self.critic_size), np.float32)
@@ -596,5 +596,5 @@ class Env:
         self.sequence[:] = self.starts.owner[self.frame]
         self.rng = rng_from_state(meta["rng"])
         self.refresh()
-        self._observe(slice(None))
+        self.observe(slice(None))
         return self.full[:, : self.obs_size], {"critic": self.full}

@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 
 import mocap.data
-from character import Character, Switches, joint_group, numberless
+from character import Character, OwnShapes, Switches, driven_groups
 from env import EPISODE_STEPS, SENSORS, Env, headset_only
 from headset.player import ride, stream_of
 from headset.reader import controllers_hang
@@ -37,6 +37,7 @@ from human import (
     travelled,
 )
 from human import footfalls as footfalls_apart
+from mocap import yardsticks
 from mocap.augment import resize
 from mocap.data import MotionFlags
 from mocap.rigs import Reading
@@ -44,7 +45,7 @@ from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cell, c
 from plumbing.files import atomic_write, check_folders
 from plumbing.runs import fmt_count
 from policy import check_fits, devices_of, find_policy, load_character, load_policy, sensors_of, total_steps
-from retarget import Reference, forward_kinematics, reference, sole_motion
+from retarget import Reference, as_human, forward_kinematics, human_of, reference, shared_segments, sole_motion
 
 ROWS = ("streamed", "tracked", "kinematic", "zero", "pd")
 HALVES = {"both": slice(None), "select": slice(0, None, 2), "report": slice(1, None, 2)}
@@ -138,57 +139,6 @@ def spring_torque(char: Character, qpos):
     return -m.jnt_stiffness[1 + h] * (qpos[:, 7 + h] - m.qpos_spring[7 + h])
 
 
-def driven_groups(char: Character) -> dict:
-    """Joint group ("hip", "tail", …) -> indices of its motors.  Test: tests/test_metrics.py::test_spring_share"""
-    names = [numberless(joint_group(char.hinges[h])) for h in char.driven]
-    return {name: np.flatnonzero(np.array(names) == name) for name in sorted(set(names))}
-
-
-class OwnShapes:
-    """Which of a character's collision shapes may be in one another's way, and how deep they are in a pose.
-
-    ASSUMED   neighbours, which are left out, are shapes of bodies at most two joints apart, and what overlaps in the
-              default pose, as a belly does with thighs
-    Test      tests/test_metrics.py::test_self_penetration
-    """
-
-    REACH = 0.2  # m beyond which a distance does not matter
-
-    def __init__(self, char: Character):
-        self.model, self.data = char.model, mujoco.MjData(char.model)
-        m = self.model
-        geoms = np.flatnonzero(m.geom_conaffinity)
-        pairs = [(a, b) for i, a in enumerate(geoms) for b in geoms[i + 1 :] if not self._near(*m.geom_bodyid[[a, b]])]
-        self.pairs = np.array(pairs, int).reshape(-1, 2)
-        rest = np.concatenate([[0.0, 0.0, char.hip_height], char.rest[char.root], char.default])
-        self._pose(rest)
-        self.pairs = self.pairs[[self._distance(a, b) > 0 for a, b in self.pairs]]
-
-    def _near(self, a, b):
-        """Are two bodies at most two joints apart in the tree?"""
-        parent = self.model.body_parentid
-        up = [{body, parent[body], parent[parent[body]]} - {0} for body in (a, b)]
-        return a in up[1] or b in up[0] or parent[a] == parent[b] != 0
-
-    def _pose(self, qpos):
-        self.data.qpos[:] = qpos
-        mujoco.mj_kinematics(self.model, self.data)
-
-    def _distance(self, a, b):
-        return mujoco.mj_geomDistance(self.model, self.data, a, b, self.REACH, None)
-
-    def overlap(self, qpos):
-        """Deepest overlap in each pose.  qpos (T, nq) -> (T,) [m], 0 where nothing overlaps"""
-        out, (a, b) = np.zeros(len(qpos)), self.pairs.T
-        reach = self.model.geom_rbound[a] + self.model.geom_rbound[b]
-        for t, q in enumerate(qpos):
-            self._pose(q)
-            apart = np.linalg.norm(self.data.geom_xpos[a] - self.data.geom_xpos[b], axis=1)
-            near = self.pairs[apart < reach]
-            out[t] = max((-self._distance(i, j) for i, j in near), default=0.0)
-        return np.maximum(out, 0.0)
-
-
 class _Pool:
     """Sums and counts by key, so that all frames of all recordings count equally."""
 
@@ -213,22 +163,34 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
 
     Frames lived count equally, whichever clip they are in; `completed` and `survival` say how many were lived.
     Joints are the bodies of the joint map; for positions and jitter the hands too.  The human's own figures are taken
-    before the scaling.  Contact and action are measured after steps, so not at the start.
+    before the scaling.  Contact and action are measured after steps, so not at the start.  In the field's own units
+    (`mocap.yardsticks`) the character is held against the human as the root's scale maps it, over the joints that both
+    have; a sequence that failed is no success.
     Returns   key -> number; NaN where there was nothing to measure (no frame, no step, no metre travelled);
               "spring_share.GROUP" of every group of driven joints
     ASSUMED   a share of springs is RMS(springs) / (RMS(springs) + RMS(motors))
     Test      tests/test_metrics.py::test_metrics_against_slow_loop, test_metrics_of_kinematic,
-              test_metrics_on_known_motion, test_nothing_to_measure
+              test_metrics_on_known_motion, test_nothing_to_measure, test_field_units_against_slow_loop
     """
     m, rate, pool = char.model, ref.rate, _Pool()
     bodies = np.array(sorted({b for b, *_ in char.chains}))
     joints = np.union1d(bodies, m.site_bodyid[char.sensor_sites])
     sip, apart, groups = sip_bodies(char), OwnShapes(char), driven_groups(char)
-    deepest, rows = [], []
+    segments, deepest, rows = shared_segments(char), [], []
+    turning = {s for s, body in segments.items() if m.body_jntnum[body]}
     for rec in recordings:
         f = rec.frames
-        sim, kin = forward_kinematics(char, rec.qpos), forward_kinematics(char, ref.qpos[f])
+        sim = forward_kinematics(char, rec.qpos)
+        kin = sim if np.array_equal(rec.qpos, ref.qpos[f]) else forward_kinematics(char, ref.qpos[f])
         rows.append((not rec.failed, (len(f) - 1) / rec.available if rec.available else 1.0))
+        both = as_human(char, sim), human_of(ref, f, segments)
+        errors, successes, joints_60 = yardsticks.held_against(*both, tuple(segments), turning, rate)
+        for key, values in errors.items():
+            pool.values(key, values)
+        for key, held in successes.items():
+            pool.values(key, [held and not rec.failed])
+        total, count = jitter(joints_60, yardsticks.RATE)
+        pool.add("jitter_km_s3", total / 1000, count)
         pool.values("root_cm", 100 * np.linalg.norm(rec.qpos[:, :3] - ref.qpos[f, :3], axis=-1))
         sites = 100 * np.linalg.norm(sim.site_xpos - ref.sensor_pos[f], axis=-1)
         pool.values("head_cm", sites[:, 0])
@@ -304,35 +266,51 @@ COLUMNS = (  # key, heading, format
     ("self_penetration_mm", "through itself mm", "{:.1f}"),
     ("spring_share", "springs", "{:.2f}"),
 )
+FIELD = (  # the same of what published tables print, at 60 Hz
+    ("mpjpe_cm", "MPJPE cm", "{:.1f}"),
+    ("mpjve_cm_s", "MPJVE cm/s", "{:.1f}"),
+    ("root_pe", "root PE cm", "{:.1f}"),
+    ("hand_pe", "hand PE cm", "{:.1f}"),
+    ("upper_pe", "upper PE cm", "{:.1f}"),
+    ("lower_pe", "lower PE cm", "{:.1f}"),
+    ("mpjre_deg", "MPJRE °", "{:.2f}"),
+    ("jitter_km_s3", "jitter km/s³", "{:.3f}"),
+    ("success_phc", "success (PHC)", "{:.2f}"),
+    ("success_height", "success (heights)", "{:.2f}"),
+)
 
 
-def table(results: dict) -> str:
+def table(results: dict, columns=COLUMNS) -> str:
     """The rows as Markdown; a dash where there is nothing to measure.
 
     The kinematic row completes by definition and has no torque: printed as a dash too.
     Test      tests/test_metrics.py::test_table
     """
-    return _markdown([["", *(h for _, h, _ in COLUMNS)], *([k, *cells(k, v)] for k, v in results.items())], results)
+    return markdown([["", *(h for _, h, _ in columns)], *([k, *cells(k, v, columns)] for k, v in results.items())])
 
 
-def comparison(results: dict) -> str:
+def comparison(results: dict, columns=COLUMNS) -> str:
     """The same with a metric a row and a policy a column.  Test: tests/test_metrics.py::test_comparison"""
-    columns = zip(*(cells(k, v) for k, v in results.items()), strict=True)
-    return _markdown([["", *results], *([h, *c] for (_, h, _), c in zip(COLUMNS, columns, strict=True))], results)
+    turned = zip(*(cells(k, v, columns) for k, v in results.items()), strict=True)
+    return markdown([["", *results], *([h, *c] for (_, h, _), c in zip(columns, turned, strict=True))])
 
 
-def _markdown(rows, results) -> str:
-    """Rows of text, the first the heading, and a line about the human."""
+def report(results: dict, layout=table) -> str:
+    """What is printed: our table, the field's, and a line about the human.
+
+    Args      layout : `table` or `comparison`
+    Test      tests/test_metrics.py::test_table, test_comparison"""
     human = next((v for k, v in results.items() if k.startswith("kinematic")), [*results.values()][-1])  # every frame
     jitter, pace = cell(human["human_jitter_m_s3"], "{:.0f}"), cell(human["human_steps_per_m"], "{:.2f}")
-    return f"{markdown(rows)}\n\nthe human: jitter {jitter} m/s³, {pace} steps/m; {human['clips']} sequences"
+    line = f"the human: jitter {jitter} m/s³, {pace} steps/m; {human['clips']} sequences"
+    return "\n\n".join([layout(results), layout(results, FIELD), line])
 
 
-def cells(name, row) -> list[str]:
-    """A row's numbers as text, in the order of COLUMNS."""
+def cells(name, row, columns=COLUMNS) -> list[str]:
+    """A row's numbers as text, in the order of the columns."""
     kinematic = ("completed", "survival", "fails_every_s", "torque_rms", "saturation", "spring_share")
     dash = kinematic if name.startswith("kinematic") else ()
-    return ["-" if k in dash else cell(row.get(k, np.nan), fmt) for k, _, fmt in COLUMNS]
+    return ["-" if k in dash else cell(row.get(k, np.nan), fmt) for k, _, fmt in columns]
 
 
 def as_json(results: dict) -> str:
@@ -555,11 +533,14 @@ def streamed(char: Character, act, clips, devices=3, threads=0) -> dict:
     pieces, first = [], []
     for start, r in zip(ref.first, rides, strict=True):
         for a, b in r.lives:
-            pieces.append(Recording(start + np.arange(a, b), r.qpos[a:b], r.contact[a:b], r.action[a:b], False, b - a))
+            parts = (v[a:b] for v in (r.qpos, r.contact, r.action))
+            pieces.append(Recording(start + np.arange(a, b), *parts, r.failures > 0, b - a))
         first.append(r.lives[0][1] if r.failures else len(r.qpos))
     failed = np.array([r.failures > 0 for r in rides])
     failures, ticks = sum(r.failures for r in rides), np.array([len(r.qpos) for r in rides])
-    return measure(char, ref, pieces) | {
+    row = measure(char, ref, pieces)
+    whole = {k: row[k] * len(pieces) / len(clips) for k in ("success_phc", "success_height")}  # of captures, not lives
+    return row | whole | {
         "clips": len(clips),
         "completed": float(np.mean(~failed)),
         "survival": float(np.mean(np.array(first) / ticks)),
@@ -695,7 +676,7 @@ def run(opt: Options) -> None:
         results = measure_all(char, ref, policy, opt, seen, () if hang else captures, devices)
         if not results:
             raise UserError("--rows streamed: there is none with controllers that hang; leave out --sensors hmd")
-        print(table(results))
+        print(report(results))
         text = as_json(results)
     if opt.json:
         atomic_write(opt.json, text)
@@ -782,7 +763,7 @@ def run_comparison(opt: Options) -> tuple[list[Arm], list]:
     arms = arms_of(long, opt)
     print(*(a.title() for a in arms), sep="\n")
     results = compare(arms, opt, captures)
-    print(comparison(results))
+    print(report(results, comparison))
     if opt.json:
         atomic_write(opt.json, as_json(results))
     return arms, long

@@ -178,7 +178,8 @@ class MLP:
 
     Equation  h_0 = x, h_{i+1} = act(h_i W_i + b_i), y = h_{n-1} W_{n-1} + b_{n-1}
     Symbols   theta : (P,), all parameters in the order W0, b0, W1, b1, ...; `params` names its pieces
-    Args      sizes : (n_0, ..., n_n), inputs first; activation : a name in ACTIVATIONS; rng : Generator;
+    Args      sizes : (n_0, ..., n_n), inputs first; activation : a name in ACTIVATIONS; rng : Generator,
+              or None: all weights zero, for those that are read from a file;
               gain : of the output layer. ASSUMED [Huang22, detail 2]: 0.01 for a policy, so that it starts
               near zero, and 1 for a value. dtype : float32, or float64 in gradient tests
     Raises    ValueError: fewer than two sizes, a size below 1, or an unknown activation
@@ -197,8 +198,8 @@ class MLP:
             raise ValueError(f"sizes is {self.sizes}, expected at least two positive integers (inputs, ..., outputs)")
         if activation not in ACTIVATIONS:
             raise ValueError(f"unknown activation {activation!r}, expected one of {sorted(ACTIVATIONS)}")
-        if not isinstance(rng, np.random.Generator):
-            raise ValueError(f"rng is {rng!r}, expected a np.random.Generator")
+        if not (rng is None or isinstance(rng, np.random.Generator)):
+            raise ValueError(f"rng is {rng!r}, expected a np.random.Generator or None")
         self.activation = activation
         self.n_layers = len(self.sizes) - 1
         self.shapes = {}  # name -> shape, in the order of theta
@@ -208,7 +209,7 @@ class MLP:
         self.n_params = sum(math.prod(shape) for shape in self.shapes.values())
         self.theta = np.zeros(self.n_params, dtype=dtype)  # (P,)
         hidden_gain = ACTIVATIONS[activation][2]
-        for i, (n_in, n_out) in enumerate(zip(self.sizes[:-1], self.sizes[1:], strict=True)):
+        for i, (n_in, n_out) in enumerate(zip(self.sizes[:-1], self.sizes[1:], strict=True) if rng else ()):
             layer_gain = gain if i == self.n_layers - 1 else hidden_gain
             self.params[f"W{i}"][:] = orthogonal(n_in, n_out, layer_gain, rng)
 

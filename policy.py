@@ -113,7 +113,7 @@ def load_policy(path) -> tuple[Policy, dict]:
     arrays, meta = loaded
     try:
         shape = _checked_shape(meta["policy"], arrays)
-        policy = Policy(sigma=1.0, rng=np.random.default_rng(0), **shape)
+        policy = Policy(sigma=1.0, rng=None, **shape)
         policy.load(arrays)
     except (KeyError, TypeError, ValueError) as e:
         raise UserError(f"{path}: not a policy ({e}); valid: a checkpoint that ppo.py wrote") from None

@@ -379,30 +379,26 @@ def run(trainer: Trainer, loaded=None, before=0):
         training.check_same(loaded[1].get("data", data), data, out)
     trainer.restore(*loaded, out / runs.CHECKPOINT) if loaded else trainer.start()
     meta = {"options": asdict(opt), "data": data, "before": before}
-    runs.open_run(out, asdict(opt) | {"data": data, "by": opt.BY}, opt.resume)
-    metrics = runs.Metrics(out / runs.METRICS, loaded[1].get("rows", 0) if loaded else None)
-    progress, saved = runs.Progress(opt.steps, trainer.steps), time.perf_counter()
+    config, rows = asdict(opt) | {"data": data, "by": opt.BY}, loaded[1].get("rows", 0) if loaded else None
+    save = lambda rows: trainer.save(out / runs.CHECKPOINT, meta | {"rows": rows})  # noqa: E731
+    progress = runs.Progress(opt.steps, trainer.steps)
+    journal = runs.Journal(out, config, opt.resume, rows, progress, save, CHECKPOINT_SECONDS)
     weights = f"policy {trainer.policy.actor.n_params:,} and critic {trainer.policy.critic.n_params:,} weights"
     inputs = f"{env.obs_size} observations ({env.critic_size} for the critic), {env.action_size} actions"
     print(f"{env.name}: {inputs}, {data['sequences']} sequences, {data['minutes']:.1f} min; {weights}")
     if trainer.steps >= opt.steps:
         print(f"nothing to do: --steps {opt.steps} is the total to reach, and {trainer.steps} are done")
-    with runs.StopFlag() as flag:
-        while trainer.steps < opt.steps and not flag.stop:
+    with journal:
+        while trainer.steps < opt.steps and not journal.stop:
             t0 = time.perf_counter()
             stats = trainer.collect()
             t1 = time.perf_counter()
             stats |= trainer.update()
             t2 = time.perf_counter()
             stats |= {"steps_per_s": trainer.reward.size / (t2 - t0), "collect_s": t1 - t0, "update_s": t2 - t1}
-            metrics.append({"update": trainer.updates, "steps": trainer.steps} | stats)
-            progress.update(trainer.steps, trainer.line(stats))
-            if t2 - saved >= CHECKPOINT_SECONDS:
-                trainer.save(out / runs.CHECKPOINT, meta | {"rows": metrics.rows})
-                saved = t2
-    trainer.save(out / runs.CHECKPOINT, meta | {"rows": metrics.rows})
-    metrics.close()
-    if flag.stop:
+            row = {"update": trainer.updates, "steps": trainer.steps} | stats
+            journal.write(trainer.steps, row, trainer.line(stats))
+    if journal.stop:
         print(f"stopped at {runs.fmt_count(trainer.steps)} steps; continue with: python ppo.py {trainer.GO_ON} {out}")
 
 
@@ -411,7 +407,9 @@ def run(trainer: Trainer, loaded=None, before=0):
 
 def make_env(opt: Options) -> Env:
     """The character, and the motions retargeted to it.  Test: tests/test_ppo.py::test_switches_reach_the_environment"""
-    char = ablated(opt.load(), opt.without, opt.track).solved_by(SOLVER)
+    whole = opt.load()
+    training.say_idle(whole, {name: WITHOUT[name] for name in opt.without})
+    char = ablated(whole, opt.without, opt.track).solved_by(SOLVER)
     clips = data.sequences(opt.motion, "train", opt.clips, seed=opt.seed, reading=Reading.of(opt))
     ref = retarget.reference(char, clips)
     shown = headset_only(ref) if opt.sensors == "hmd" else ref

@@ -24,6 +24,7 @@ from human import (
     FEET,
     PARENTS,
     SEG,
+    SENSORS,
     Clip,
     angular_velocity,
     contacts,
@@ -311,6 +312,34 @@ def rest_offset(char: Character, quat):
     return quat_mul(quat, char.rest[[char.root, char.head]])
 
 
+def shared_segments(char: Character) -> dict[int, int]:
+    """Which of the canonical human's segments a character has: segment -> body, in the human's order.
+
+    The root is its pelvis.  The last body of a chain of the joint map is the segment that the chain leads to.  A body
+    that carries a controller is a hand, unless it is another segment already.
+    Test      tests/test_retarget.py::test_as_human
+    """
+    found = {SEG["pelvis"]: char.root}
+    found |= {to: body for body, _, _, _, to, shares in char.chains if not shares}
+    for name, site in zip(SENSORS[1:], char.sensor_sites[1:], strict=True):
+        body = int(char.model.site_bodyid[site])
+        if body not in found.values():
+            found.setdefault(SEG[name], body)
+    return dict(sorted(found.items()))
+
+
+def as_human(char: Character, fk: Kinematics):
+    r"""A character's poses as the canonical human's: the way back from `retarget`, over the segments that both have.
+
+    Equation  Q_segment = R_body R_rest⁻¹; a segment's joint is its body's origin
+    Frame     world
+    Returns   positions (T, s, 3) [m], rotations (T, s, 4), of `shared_segments`
+    Test      tests/test_retarget.py::test_as_human
+    """
+    bodies = list(shared_segments(char).values())
+    return fk.xpos[:, bodies], quat_mul(fk.xquat[:, bodies], quat_conj(char.rest[bodies]))
+
+
 @dataclass
 class Reference:
     """All that the environment compares with, for F frames of one or more sequences laid end to end.
@@ -383,6 +412,19 @@ def _reference_of(char, clip):
         sensor_scale=np.tile(size, (len(clip), 1)).astype(f32),
         human_rot=quat_matrix(clip.quat)[..., :2].astype(f32),
     )
+
+
+def human_of(ref: Reference, frames, segments):
+    """The human of a Reference, as the root's scale maps it: positions (T, s, 3) [m], rotations (T, s, 4), world.
+
+    ASSUMED   that this is the true motion of a character whose body is another
+    Args      frames (T,); segments : indices into `human.SEGMENTS`
+    Test      tests/test_retarget.py::test_as_human
+    """
+    at = np.ix_(frames, list(segments))
+    x, y = np.moveaxis(ref.human_rot[at].astype(float), -1, 0)
+    turn = Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], axis=-1).reshape(-1, 3, 3))
+    return ref.human_pos[at].astype(float), turn.as_quat(scalar_first=True).reshape(*x.shape[:-1], 4)
 
 
 # ------------------------------------------------------------------------------------ artefacts

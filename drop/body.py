@@ -187,18 +187,18 @@ def _limits():
 
 
 LOW, HIGH = _limits()
-_EYE, _EYE3 = np.eye(N), np.eye(3)
-_SKEW = np.zeros((3, 9))  # v @ _SKEW is the matrix [v]×, row by row
-_SKEW[0, [5, 7]], _SKEW[1, [2, 6]], _SKEW[2, [1, 3]] = (-1, 1), (1, -1), (-1, 1)
+EYE, EYE3 = np.eye(N), np.eye(3)
+SKEW = np.zeros((3, 9))  # v @ SKEW is the matrix [v]×, row by row
+SKEW[0, [5, 7]], SKEW[1, [2, 6]], SKEW[2, [1, 3]] = (-1, 1), (1, -1), (-1, 1)
 
 
 def _turn(vectors):
     """Rotation vectors (K, 3) -> matrices (K, 3, 3), by Rodrigues' formula."""
     angle = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
-    K = (vectors @ _SKEW).reshape(-1, 3, 3)
+    K = (vectors @ SKEW).reshape(-1, 3, 3)
     safe = np.maximum(angle, 1e-12)
     s, c = np.sin(angle) / safe, 2.0 * (np.sin(0.5 * angle) / safe) ** 2
-    return _EYE3 + s[:, None, None] * K + c[:, None, None] * (K @ K)
+    return EYE3 + s[:, None, None] * K + c[:, None, None] * (K @ K)
 
 
 def swing(axis, towards):
@@ -209,7 +209,7 @@ def swing(axis, towards):
     Returns   (K, 3) [rad], across `axis`
     Test      tests/drop/test_drop.py::test_swing_twist
     """
-    n = np.matmul((axis @ _SKEW).reshape(-1, 3, 3), towards[:, :, None])[:, :, 0]
+    n = np.matmul((axis @ SKEW).reshape(-1, 3, 3), towards[:, :, None])[:, :, 0]
     sine, cosine = np.sqrt(np.einsum("ij,ij->i", n, n)), np.einsum("ij,ij->i", axis, towards)
     angle = np.arctan2(sine, cosine)
     out = n * (angle / np.maximum(sine, 1e-12))[:, None]
@@ -273,12 +273,12 @@ def swing_twist(x, twist):
 
 def _swing_matrix(axis, towards):
     """The turn of `swing` as matrices: I + [n]× + [n]×²/(1 + a · u), n = a × u (Rodrigues' formula without angles)."""
-    n = np.matmul((axis @ _SKEW).reshape(-1, 3, 3), towards[:, :, None])[:, :, 0]
+    n = np.matmul((axis @ SKEW).reshape(-1, 3, 3), towards[:, :, None])[:, :, 0]
     cosine = np.einsum("ij,ij->i", axis, towards)
     if cosine.min() < -1.0 + 1e-9:
         return _turn(swing(axis, towards))
-    K = (n @ _SKEW).reshape(-1, 3, 3)
-    return _EYE3 + K + K @ K / (1.0 + cosine)[:, None, None]
+    K = (n @ SKEW).reshape(-1, 3, 3)
+    return EYE3 + K + K @ K / (1.0 + cosine)[:, None, None]
 
 
 def project_range_of_motion(x, twist, solved=None):
@@ -298,7 +298,7 @@ def project_range_of_motion(x, twist, solved=None):
     local[:, :2] = np.matmul(BASIS, vectors[:, :, None])[:, :, 0]
     local[:, 2] = twist[0]
     spine = _swing_matrix(AXIS[9:10], u[9:10])[0].T @ R[6].T @ R[9]  # what is left is a turn about the axis
-    local[9, 2] = np.arctan2(0.5 * np.sum((AXIS[9] @ _SKEW).reshape(3, 3) * spine), 0.5 * (np.trace(spine) - 1.0))
+    local[9, 2] = np.arctan2(0.5 * np.sum((AXIS[9] @ SKEW).reshape(3, 3) * spine), 0.5 * (np.trace(spine) - 1.0))
     clipped = np.minimum(np.maximum(local, LOW), HIGH)
     if np.abs(clipped - local)[LIMITED].max() < 1e-9:
         return x
@@ -314,8 +314,10 @@ def project_range_of_motion(x, twist, solved=None):
 # ------------------------------------------------------------------------------------ checks
 
 
-def _checked(value, shape, name, largest=1e9):
-    """The value as an array of floats, or one line that says what is wrong with it."""
+def checked(value, shape, name, largest=1e9):
+    """The value as an array of floats, or one line that says what is wrong with it.
+
+    Test      tests/drop/test_drop.py::test_bad_input"""
     try:
         value = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -329,8 +331,10 @@ def _checked(value, shape, name, largest=1e9):
     return value
 
 
-def _unit(quat, name):
-    """The quaternions (..., 4), which must have length 1 within a hundredth."""
+def checked_unit(quat, name):
+    """The quaternions (..., 4), which must have length 1 within a hundredth.
+
+    Test      tests/drop/test_drop.py::test_bad_input"""
     square = np.einsum("...i,...i", quat, quat)
     if np.abs(square - 1.0).max() > 0.02:
         worst = square.ravel()[np.abs(square - 1.0).argmax()]

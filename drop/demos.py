@@ -17,22 +17,19 @@ a trunk more than 60 degrees from the vertical, at the end or for half a second.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
-import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from drop import body, simulator
 from drop.body import GRAVITY, LENGTHS, RADII, STANDING, STEP, J, N
+from drop.momenta import root_wrench
+from drop.pictures import check_outputs, write_pictures
 from drop.prior import WEIGHTS, ClipPrior, NearestPrior, PoseRange, SwitchPrior, VaePrior, load_networks
 from drop.simulator import Plane, Simulator, Spheres
-from human import Clip, heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate
+from human import Clip, heading, quat_about, quat_mul, quat_rotate
 from mocap import gait
 from mocap.data import MOTION, load
-from plumbing import render
 from plumbing.cli import NONNEGATIVE, UserError, arg, cli
 
 
@@ -268,7 +265,7 @@ def push(stage, rng):
                     continue
                 sim, state = stage.start(speed)
                 left = quat_rotate(quat_about(2, heading(state.quat[0])), np.array([0.0, 1.0, 0.0]))
-                act = _pushing(joint, newton * left)
+                act = pushing(joint, newton * left)
                 take = single(f"{word} {where} {size} {newton:.0f} N", sim, state, 180, stage.again(), act)
                 take.window = (30, 94)
                 take.notes["away from the unpushed take"] = _displacement(take, undisturbed)
@@ -288,7 +285,8 @@ def _displacement(take, undisturbed):
     return f"{away[PUSH_FRAMES[1] - 1]:.1f} cm when the push ends, {later:.1f} 1 s later"
 
 
-def _pushing(joint, vector, frames=PUSH_FRAMES):
+def pushing(joint, vector, frames=PUSH_FRAMES):
+    """What `single` does in every frame: a constant force on a joint in those of `frames`.  vector (3,) [N]"""
     def act(t, state):
         return (one_force(joint, vector) if frames[0] <= t < frames[1] else None), {}, ()
 
@@ -607,72 +605,9 @@ def backflip(stage, rng):
     after = stage.general or ClipPrior(x, quat, first)
     sim, _ = stage.start(0.0, prior=SwitchPrior(ClipPrior(x, quat, first), after, onset))
     state = sim.begin(x[first], quat[first], (x[first] - x[first - 1]) / STEP)
-    act = _pushing("spine3", np.array([0.0, 60.0, 0.0]), (onset, onset + 8))
+    act = pushing("spine3", np.array([0.0, 60.0, 0.0]), (onset, onset + 8))
     take = single(f"backflip {name}", sim, state, onset + 90, rng, act)
     return [take]
-
-
-def cylinder_inertia():
-    r"""Masses, centres and inertias of the bones as cylinders, 22 kg in all.
-
-    ASSUMED   radii 0.8 of the thinner end's contact sphere (trunk 0.10 m), equal density
-    Returns   mass (21,) [kg]; inertia (21, 3, 3) about the bone's middle, in the parent joint's frame [kg m²]
-    Test      tests/drop/test_drop_demos.py::test_cylinder_momenta
-    """
-    trunk = np.array([body.JOINTS[j].startswith(("spine", "neck", "collar")) for j in range(1, N)])
-    r = np.where(trunk, 0.10, 0.8 * np.minimum(RADII[1:], RADII[body.PARENTS[1:]]))
-    mass = LENGTHS * r * r
-    mass *= N / mass.sum()
-    axis = body.OFFSETS[1:] / LENGTHS[:, None]
-    along, across = mass * r * r / 2, mass * (3 * r * r + LENGTHS**2) / 12
-    outer = axis[:, :, None] * axis[:, None]
-    return mass, along[:, None, None] * outer + across[:, None, None] * (np.eye(3) - outer)
-
-
-def momenta_of_cylinders(x, quat, h=STEP):
-    r"""Change of linear and angular momentum of a motion whose bones are cylinders (Fig. 7's second model).
-
-    Equation  Ṗ, L̇ = differences of Σ m v and Σ m r × v + I ω between the half steps before and after t, r from the
-              centre of mass at t, I at t
-    Args      x (T, 22, 3), quat (T, 22, 4)
-    Returns   (T − 2, 6) for frames 1 to T − 2; centre of mass (T − 2, 3)
-    Test      tests/drop/test_drop_demos.py::test_cylinder_momenta
-    """
-    mass, local = cylinder_inertia()
-    middle = 0.5 * (x[:, 1:] + x[:, body.PARENTS[1:]])
-    turn = quat[:, body.PARENTS[1:]]
-    v = np.diff(middle, axis=0) / h
-    step = quat_mul(turn[1:], quat_conj(turn[:-1]))
-    omega = Rotation.from_quat(step.reshape(-1, 4), scalar_first=True).as_rotvec().reshape(v.shape) / h
-    com = np.einsum("j,tji->ti", mass, middle) / mass.sum()
-    R = quat_matrix(turn[1:-1])
-    inertia = R @ local @ np.swapaxes(R, -1, -2)
-    r = middle[1:-1] - com[1:-1, None]
-    spin = lambda w: np.matmul(inertia, w[..., None])[..., 0]  # noqa: E731
-    L = [(mass[:, None] * np.cross(r, a) + spin(w)).sum(axis=1) for a, w in ((v[:-1], omega[:-1]), (v[1:], omega[1:]))]
-    P = [np.einsum("j,tji->ti", mass, a) for a in (v[:-1], v[1:])]
-    return np.concatenate([P[1] - P[0], L[1] - L[0]], axis=1) / h, com[1:-1]
-
-
-def root_wrench(x, quat, cylinders=False):
-    r"""The root wrench metric of a motion that is given, frame by frame  [DROP §8.5, Fig. 7].
-
-    Equation  ‖b − F c‖ of Eq. 11, b by differences of the motion itself; the body as points or as cylinders
-    Returns   (T − 2,) [N, N m], of 22 kg
-    Test      tests/drop/test_drop_demos.py::test_root_wrench_of_motions
-    """
-    if cylinders:
-        b, com = momenta_of_cylinders(x, quat)
-    else:
-        v = np.diff(x, axis=0) / STEP
-        b = np.array([simulator.momentum_rate(x[t + 1], x[t], v[t - 1]) for t in range(1, len(x) - 1)])
-        com = x[1:-1].mean(axis=1)
-    sim, out = Simulator(), []
-    for t, (rate, centre) in enumerate(zip(b, com), 1):
-        F, _ = simulator.friction_basis(*sim.touching(x[t]), centre)
-        need = rate - np.append(N * GRAVITY, np.zeros(3))
-        out.append(np.linalg.norm(simulator.contact_forces(F, need)[1]))
-    return np.array(out)
 
 
 def wrench(stage, rng):
@@ -688,7 +623,7 @@ def wrench(stage, rng):
         sim, state = stage.start(2.5)
         sim.correction = correction
         undisturbed = _centres(single("", sim, state, 120, stage.again(), lambda t, state: (None, {}, ())))
-        act = _pushing("spine3", np.array([0.0, 120.0, 0.0]))
+        act = pushing("spine3", np.array([0.0, 120.0, 0.0]))
         take = single(f"run pushed {'' if correction else 'un'}corrected", sim, state, 120, stage.again(), act)
         take.window = (30, 94)
         pd, left = (np.array([getattr(o[0], n) for o in take.outcomes]) for n in ("wrench_pd", "wrench"))
@@ -720,7 +655,7 @@ def weights(stage, rng):
         sim, state = stage.start(1.2, weights=w)
         left = quat_rotate(quat_about(2, heading(state.quat[0])), np.array([0.0, 100.0, 0.0]))
         torso, hand, free = (single("", sim, state, 18, stage.again(), act) for act in (
-            _pushing("spine3", left, (10, 18)), _pushing("wrist_l", left, (10, 18)), nothing))  # fmt: skip
+            pushing("spine3", left, (10, 18)), pushing("wrist_l", left, (10, 18)), nothing))  # fmt: skip
         bone = max(o[0].bone_error for o in torso.outcomes)
         moved = np.linalg.norm((hand.states[-1][0].x - free.states[-1][0].x)[J["wrist_l"]])
         (angle, _), (_, alone) = forearm(w), forearm(w, restore=False)
@@ -765,114 +700,7 @@ DEMOS = {
 }  # fmt: skip
 
 
-# ------------------------------------------------------------------------------------ pictures
-
-WORLD = """<mujoco><visual><map zfar="60"/>
-<headlight ambient=".35 .35 .35" diffuse=".4 .4 .4" specular="0 0 0"/></visual>
-<asset><texture name="t" type="2d" builtin="checker" rgb1=".82 .84 .86" rgb2=".70 .73 .76" width="200" height="200"/>
-<material name="m" texture="t" texrepeat="1 1" texuniform="true"/>
-<texture type="skybox" builtin="gradient" rgb1=".95 .97 1" rgb2=".75 .82 .9" width="64" height="64"/></asset>
-<worldbody><body name="floor" mocap="true"><geom type="plane" size="40 40 .1" material="m"/></body>
-<body name="light" mocap="true"><light pos="2 -2 6" dir="-.3 .3 -1" directional="true" diffuse=".5 .5 .5"/></body>
-</worldbody></mujoco>"""
-COLOURS = ((0.25, 0.5, 0.85, 1.0), (0.85, 0.5, 0.25, 1.0))
-
-
-def body_shapes(x, rgba):
-    """Capsules and a head for one character (22, 3).  Test: tests/drop/test_drop_demos.py::test_shapes_and_arrows"""
-    dark = tuple(0.6 * np.array(rgba[:3])) + (1.0,)
-    shapes = []
-    for j in range(1, N):
-        side = body.JOINTS[j].endswith("_r")
-        radius = min(RADII[j], RADII[body.PARENTS[j]], 0.075) * 0.8
-        shapes.append(render.Bone(x[body.PARENTS[j]], x[j], dark if side else rgba, radius))
-    return shapes + [render.Marker(x[J["head"]] + [0, 0, 0.02], None, rgba, 0.1)]
-
-
-def arrow(place, vector, rgba, scale=0.005, longest=0.8, leaves=False):
-    """A force as an arrow that ends at `place`; or that leaves it, as a floor's does, which would be hidden below.
-
-    Test: tests/drop/test_drop_demos.py::test_shapes_and_arrows, ::test_contact_forces_are_drawn_above_the_floor"""
-    v = scale * np.asarray(vector)
-    v = v * min(1.0, longest / max(np.linalg.norm(v), 1e-9))
-    if np.linalg.norm(v) < 0.02:
-        return []
-    place = place + v if leaves else place
-    return [
-        render.Bone(place - v, place - 0.12 * v, rgba, 0.012),
-        render.Bone(place - 0.2 * v, place - 0.1 * v, rgba, 0.03),
-    ]
-
-
-def contact_arrows(found):
-    """An Outcome's contact forces.
-
-    Test      tests/drop/test_drop_demos.py::test_contact_forces_are_drawn_above_the_floor"""
-    arrows = (arrow(p, f, (0.1, 0.2, 0.9, 1.0), 0.002, leaves=True) for p, f in zip(found.points, found.forces))
-    return [shape for shapes in arrows for shape in shapes]
-
-
-def draw(scene, data, take, t):
-    """One frame of a take (H, W, 3)."""
-    floor = take.floor[t]
-    turn = np.cross([0, 0, 1.0], floor.normal)
-    data.mocap_quat[0] = np.append(1.0 + floor.normal[2], turn) / np.linalg.norm(np.append(1.0 + floor.normal[2], turn))
-    centre = np.mean([s.com for s in take.states[t]], axis=0)
-    data.mocap_pos[:] = floor.offset * floor.normal, centre * [1, 1, 0]  # the light goes along, or shadows end
-    mujoco.mj_forward(scene.model, data)
-    shapes = []
-    for k, (state, found) in enumerate(zip(take.states[t], take.outcomes[t])):
-        shapes += body_shapes(state.x, COLOURS[k % 2])
-        shapes += contact_arrows(found)
-    for p, f in take.arrows[t]:
-        shapes += arrow(p, f, (0.9, 0.1, 0.1, 1.0), 0.008)
-    shapes += [
-        render.Marker(p, None, rgba, radius) for p, radius, rgba in take.balls[t] if np.abs(p - centre).max() < 8
-    ]
-    camera = mujoco.MjvCamera()
-    ground = (floor.offset - floor.normal[:2] @ centre[:2]) / floor.normal[2]
-    camera.lookat[:] = [centre[0], centre[1], 0.8 + ground]
-    apart = max(np.linalg.norm(s.com - centre) for s in take.states[t])
-    camera.distance, camera.azimuth, camera.elevation = (4.0 if apart else 3.2) + 2.0 * apart, 130, -14
-    return scene.frame(data, camera, shapes)
-
-
-def write_pictures(takes, opt, columns=9):
-    """The contact sheet, a row a take, and the video, one take after the other."""
-    model = mujoco.MjModel.from_xml_string(WORLD)
-    data = mujoco.MjData(model)
-    if opt.png:
-        scene = render.Scene(model, 240, 300, camera=mujoco.MjvCamera(), fast=True)
-        scene.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = True  # they show which foot stands
-        frames, labels = [], []
-        for take in takes:
-            shown = np.linspace(*(take.window or (0, len(take.states) - 1)), columns).round().astype(int)
-            for t in shown:
-                frames.append(draw(scene, data, take, t))
-                labels.append(f"{t * STEP:.1f} s {take.name if t == shown[0] else ''}")
-        render.write_png(
-            opt.png, render.contact_sheet([render.label_image(f, s, 1) for f, s in zip(frames, labels)], None, columns)
-        )
-        print(opt.png)
-        scene.close()
-    if opt.video:
-        scene = render.Scene(model, 640, 480, camera=mujoco.MjvCamera())
-        every = (
-            render.label_image(draw(scene, data, take, t), take.name) for take in takes for t in range(len(take.states))
-        )
-        render.write_video(opt.video, every, fps=round(1 / STEP))
-        print(opt.video)
-
-
-def check_outputs(opt):
-    """Can the pictures be written?  Before the slow work.
-
-    Test: tests/drop/test_drop_demos.py::test_outputs_are_checked_first"""
-    for path in map(Path, filter(None, (opt.png, opt.video))):
-        if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-            raise UserError(f"cannot write {path}: give a file in a folder that exists and is writable")
-    if opt.video:
-        render._extra("imageio")
+# ------------------------------------------------------------------------------------ command line
 
 
 def main(argv, others=()):

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drop import body, demos, simulator
+from drop import body, demos, momenta, pictures, simulator
 from drop.body import GRAVITY, PARENTS, STANDING, STEP, N
 from drop.simulator import Plane, Simulator
 from human import quat_angle
@@ -180,8 +180,8 @@ def energies(opt):
 
 def draw(opt, stage, found, medians):
     """The figure of `energies`.  Test: tests/drop/test_drop_figures.py::test_command"""
-    render._extra("matplotlib")
-    figure = render._extra("matplotlib.figure").Figure(figsize=(13, 8), layout="constrained")
+    render.extra("matplotlib")
+    figure = render.extra("matplotlib.figure").Figure(figsize=(13, 8), layout="constrained")
     panels = figure.subplots(2, 2).ravel()
     one = next((i for i, n in enumerate(found["full"][2]) if n.startswith("walk") or "_walk" in n), 0)
     shown = (
@@ -198,11 +198,11 @@ def draw(opt, stage, found, medians):
     name, x, quat = demos.pick_motion(stage.clips, 2.5)
     n = min(len(x), 122)
     for cylinders, label in ((False, "points"), (True, "cylinders")):
-        panels[3].plot(demos.root_wrench(x[:n], quat[:n], cylinders), label=f"{name}, {label}")
+        panels[3].plot(momenta.root_wrench(x[:n], quat[:n], cylinders), label=f"{name}, {label}")
     for correction, label in ((False, "solved"), (True, "corrected")):
         sim, state = stage.start(2.5)
         sim.correction = correction
-        act = demos._pushing("spine3", np.array([0.0, 120.0, 0.0]))
+        act = demos.pushing("spine3", np.array([0.0, 120.0, 0.0]))
         take = demos.single(label, sim, state, 120, np.random.default_rng(opt.seed), act)
         panels[3].plot([o[0].wrench for o in take.outcomes], label=f"pushed run, {label}")
     panels[3].set(title="Fig. 7: root wrench of 22 kg [N, N m]", xlabel="frame"), panels[3].legend(fontsize=8)
@@ -227,7 +227,7 @@ def ablations(opt):
                          ("no contact", {"contact": False}), ("no correction", {"correction": False})):  # fmt: skip
         stage = demos.Stage(replace(opt, **switch))
         sim, state = stage.start(1.2)
-        act = demos._pushing("spine3", np.array([0.0, 2.0 * opt.newton, 0.0]))
+        act = demos.pushing("spine3", np.array([0.0, 2.0 * opt.newton, 0.0]))
         take = demos.single(name, sim, state, 150, np.random.default_rng(opt.seed), act)
         take.window = (30, 94)
         after = slice(demos.PUSH_FRAMES[0], None)
@@ -346,7 +346,7 @@ def failures(opt):
     detect, takes = Detector.calibrated(stage.clips), []
     for name, speed, newton in (("walk", 1.2, 0.0), ("walk pushed over", 1.2, 300.0), ("run pushed over", 2.5, 300.0)):
         sim, state = stage.start(speed)
-        act = demos._pushing("spine3", np.array([0.0, max(newton, 1e-3), 0.0]))
+        act = demos.pushing("spine3", np.array([0.0, max(newton, 1e-3), 0.0]))
         take = demos.single(name, sim, state, 240, np.random.default_rng(opt.seed), act)
         take.window = (30, 238)
         states, found = [s[0] for s in take.states], [o[0] for o in take.outcomes]
@@ -373,4 +373,4 @@ def main(argv):
     for take in takes or ():
         print(demos.report(take))
     if takes and (opt.png or opt.video):
-        demos.write_pictures(takes, opt)
+        pictures.write_pictures(takes, opt)

@@ -425,9 +425,8 @@ def load_networks(path=WEIGHTS):
     try:
         o = meta["options"]
         pick = lambda net, names: {k: arrays[f"{net}.{k}"] for k in names}  # noqa: E731
-        rng = np.random.default_rng(0)
-        motion = vae.MotionVAE(o["latent"], o["hidden"], pick("motion", ("mean", "std", "scale", "offset")), rng)
-        pose = vae.PoseVAE(o["pose_latent"], o["pose_hidden"], pick("pose", ("mean", "std")), rng)
+        motion = vae.MotionVAE(o["latent"], o["hidden"], pick("motion", ("mean", "std", "scale", "offset")), None)
+        pose = vae.PoseVAE(o["pose_latent"], o["pose_hidden"], pick("pose", ("mean", "std")), None)
         for name, net in vae.networks(motion, pose).items():
             if arrays[name].shape != net.theta.shape:
                 raise ValueError(f"{name} has {arrays[name].size} weights, not {net.n_params}")

@@ -26,18 +26,18 @@ from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 from drop.body import (
-    _EYE,
-    _EYE3,
-    _SKEW,
     DIFFERENCE,
+    EYE,
+    EYE3,
     GRAVITY,
     LENGTHS,
     PATH,
     RADII,
+    SKEW,
     STEP,
     N,
-    _checked,
-    _unit,
+    checked,
+    checked_unit,
     project_range_of_motion,
     swing_twist,
     twists,
@@ -111,7 +111,7 @@ class Plane:
     offset: float = 0.0
 
     def __post_init__(self):
-        normal = _checked(self.normal, (3,), "Plane: normal")
+        normal = checked(self.normal, (3,), "Plane: normal")
         length = np.sqrt(normal @ normal)
         if not (length > 1e-9 and np.isfinite(self.offset)):
             raise ValueError(f"Plane: normal {self.normal} and offset {self.offset} are no half space")
@@ -150,7 +150,7 @@ class Box:
     quat: np.ndarray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
 
     def __post_init__(self):
-        object.__setattr__(self, "quat", _unit(_checked(self.quat, (4,), "Box: quat")[None], "Box: quat")[0])
+        object.__setattr__(self, "quat", checked_unit(checked(self.quat, (4,), "Box: quat")[None], "Box: quat")[0])
 
     def distance(self, x):
         """Signed distance (K,) and outward normal (K, 3) of points (K, 3)."""
@@ -271,7 +271,7 @@ def wrench_map(x_t, v_t, force, h=STEP):
     r = x_t - x_t.mean(axis=0)
     B = np.zeros((6, N, 3))
     B[[0, 1, 2], :, [0, 1, 2]] = 1.0 / h**2
-    B[3:] = np.swapaxes((r @ _SKEW).reshape(N, 3, 3), 0, 1) / h**2
+    B[3:] = np.swapaxes((r @ SKEW).reshape(N, 3, 3), 0, 1) / h**2
     B = B.reshape(6, -1)
     free = x_t + h * v_t + h * h * (force + GRAVITY)  # where B x − a is 0: Eq. 1's y
     return B, B @ free.ravel()
@@ -285,14 +285,14 @@ def friction_basis(points, normals, com, mu=MU, edges=EDGES):
     Returns   F (6, P edges); d (P edges, 3) unit length
     Test      tests/drop/test_drop.py::test_friction_basis
     """
-    across = np.where(np.abs(normals[:, :1]) < 0.9, _EYE3[:1], _EYE3[1:2])
-    s = np.matmul((normals @ _SKEW).reshape(-1, 3, 3), across[:, :, None])[:, :, 0]
+    across = np.where(np.abs(normals[:, :1]) < 0.9, EYE3[:1], EYE3[1:2])
+    s = np.matmul((normals @ SKEW).reshape(-1, 3, 3), across[:, :, None])[:, :, 0]
     s /= np.sqrt(np.einsum("ij,ij->i", s, s))[:, None]
-    t = np.matmul((normals @ _SKEW).reshape(-1, 3, 3), s[:, :, None])[:, :, 0]
+    t = np.matmul((normals @ SKEW).reshape(-1, 3, 3), s[:, :, None])[:, :, 0]
     angle = 2 * np.pi * np.arange(edges) / edges
     d = normals[:, None] + mu * (np.cos(angle)[:, None] * s[:, None] + np.sin(angle)[:, None] * t[:, None])
     d = (d / np.sqrt(1 + mu * mu)).reshape(-1, 3)
-    arm = (np.repeat(points - com, edges, axis=0) @ _SKEW).reshape(-1, 3, 3)
+    arm = (np.repeat(points - com, edges, axis=0) @ SKEW).reshape(-1, 3, 3)
     return np.concatenate([d, np.matmul(arm, d[:, :, None])[:, :, 0]], axis=1).T, d
 
 
@@ -477,11 +477,11 @@ class Simulator:
         Returns   State, Outcome
         Raises    ValueError: a state, force, target or prior's output that is not finite or has a wrong shape
         """
-        x_t, v_t = _checked(state.x, (N, 3), "state's positions"), _checked(state.v, (N, 3), "state's velocities")
-        _unit(_checked(state.quat, (N, 4), "state's rotations"), "state's rotations")
-        force = np.zeros((N, 3)) if force is None else _checked(force, (N, 3), "force")
-        v_tar = None if v_tar is None else _checked(v_tar, (2,), "v_tar")
-        pins = {} if pins is None else {int(j): _checked(p, (3,), f"pin of joint {j}") for j, p in pins.items()}
+        x_t, v_t = checked(state.x, (N, 3), "state's positions"), checked(state.v, (N, 3), "state's velocities")
+        checked_unit(checked(state.quat, (N, 4), "state's rotations"), "state's rotations")
+        force = np.zeros((N, 3)) if force is None else checked(force, (N, 3), "force")
+        v_tar = None if v_tar is None else checked(v_tar, (2,), "v_tar")
+        pins = {} if pins is None else {int(j): checked(p, (3,), f"pin of joint {j}") for j, p in pins.items()}
         pinned = tuple(sorted(pins))
         if pinned and not 0 <= pinned[0] <= pinned[-1] < N:
             raise ValueError(f"pins of joints {pinned}: joints are 0 to {N - 1}")
@@ -596,25 +596,25 @@ class Simulator:
         if samples.shape[:1] == rotations.shape[:1] == (0,):
             return nothing
         m = max(samples.shape[:1], (1,))[0]
-        _checked(samples, (m, N, 3), f"{name}: positions")
-        _unit(_checked(rotations, (m, N, 4), f"{name}: rotations"), f"{name}: rotations")
+        checked(samples, (m, N, 3), f"{name}: positions")
+        checked_unit(checked(rotations, (m, N, 4), f"{name}: rotations"), f"{name}: rotations")
         mode, turned = _pair(self.prior.mode(state), f"{name}: mode")
-        _checked(mode, (N, 3), f"{name}: mode's positions")
-        _unit(_checked(turned, (N, 4), f"{name}: mode's rotations"), f"{name}: mode's rotations")
+        checked(mode, (N, 3), f"{name}: mode's positions")
+        checked_unit(checked(turned, (N, 4), f"{name}: mode's rotations"), f"{name}: mode's rotations")
         return np.concatenate([mode[None], samples]), np.concatenate([turned[None], rotations])
 
     def begin(self, x, quat, v=None):
         """A State at rest or with velocities v, lifted until no sphere is in an obstacle.
 
         Test: tests/drop/test_drop.py::test_starting_under_the_floor"""
-        x, quat = _checked(x, (N, 3), "positions").copy(), _checked(quat, (N, 4), "rotations")
-        v = np.zeros((N, 3)) if v is None else _checked(v, (N, 3), "velocities").copy()
+        x, quat = checked(x, (N, 3), "positions").copy(), checked(quat, (N, 4), "rotations")
+        v = np.zeros((N, 3)) if v is None else checked(v, (N, 3), "velocities").copy()
         for _ in range(200):
             gap = gaps(x, self.obstacles)[0].min()
             if gap >= -1e-3:
                 break
             x[:, 2] += max(-gap, 1e-3)
-        return State(x, v, _unit(quat, "rotations").copy(), 0, v.copy())
+        return State(x, v, checked_unit(quat, "rotations").copy(), 0, v.copy())
 
 
 def restore_bones(x, anchor, iterations=3):
@@ -638,7 +638,7 @@ def restore_bones(x, anchor, iterations=3):
         if np.abs(error).max() < 1e-6 or length.min() < 1e-3:
             break
         d = bones / length[:, None]
-        lam = np.linalg.solve(coupling * (d @ d.T) + 1e-9 * _EYE[1:, 1:], error)
+        lam = np.linalg.solve(coupling * (d @ d.T) + 1e-9 * EYE[1:, 1:], error)
         x = x - (DIFFERENCE.T @ (lam[:, None] * d)) / anchor[:, None]
     out = PATH @ project_rigidity(x)
     return out + anchor @ (x - out) / anchor.sum()

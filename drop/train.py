@@ -30,14 +30,12 @@ from nn import Adam, clip_grad_norm
 from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UNIT, UserError, arg, cli
 from plumbing.runs import (
     CHECKPOINT,
-    METRICS,
-    Metrics,
+    Journal,
+    Means,
     Progress,
-    StopFlag,
     check_run,
     git_state,
     latest_checkpoint,
-    open_run,
     rng_from_state,
     rng_state,
     save_checkpoint,
@@ -298,35 +296,27 @@ def train(opt):
         meta = found[1]
     elif opt.init:
         trainer.begin_from(opt.init)
-    out = open_run(opt.out, opt, opt.resume)
-    metrics = Metrics(out / METRICS, meta["rows"] if opt.resume else None)
-    progress, saved = Progress(opt.updates, trainer.updates, "updates"), time.monotonic()
+    out = Path(opt.out)
+
+    def save(rows):
+        kept = {"options": vars(opt), "updates": trainer.updates, "rng": rng_state(trainer.rng), "rows": rows}
+        save_checkpoint(out / CHECKPOINT, trainer.arrays(), kept)
+
+    rows, progress = meta["rows"] if opt.resume else None, Progress(opt.updates, trainer.updates, "updates")
+    journal = Journal(out, opt, opt.resume, rows, progress, save, 60 * opt.checkpoint_minutes)
     sizes = {k: net.n_params for k, net in trainer.nets.items()}
     print(f"{sum(recording.lengths)} frames; weights: " + ", ".join(f"{k} {n}" for k, n in sizes.items()))
-
-    def save():
-        path = out / CHECKPOINT
-        kept = {"options": vars(opt), "updates": trainer.updates, "rng": rng_state(trainer.rng), "rows": metrics.rows}
-        save_checkpoint(path, trainer.arrays(), kept)
-
-    sums, count = {}, 0
-    with StopFlag() as flag:
-        while trainer.updates < opt.updates and not flag.stop:
-            for name, value in trainer.iterate().items():
-                sums[name] = sums.get(name, 0.0) + value
-            count += 1
-            if count == COUNT_SHOWN or trainer.updates >= opt.updates:
+    means = Means()
+    with journal:
+        while trainer.updates < opt.updates and not journal.stop:
+            means.add(trainer.iterate())
+            if means.count == COUNT_SHOWN or trainer.updates >= opt.updates:
                 lr, kl, own = trainer.schedule()
-                row = {k: v / count for k, v in sums.items()}
-                metrics.append({"updates": trainer.updates, **row, "lr": lr, "kl_weight": kl, "own": own})
-                progress.update(trainer.updates, {k: f"{v:.1f}" for k, v in row.items()} | {"own": f"{own:.2f}"})
-                sums, count = {}, 0
-            if time.monotonic() - saved > 60 * opt.checkpoint_minutes and count == 0:
-                save()
-                saved = time.monotonic()
-        save()
-    metrics.close()
-    if flag.stop:
+                row = means.take()
+                line = {k: f"{v:.1f}" for k, v in row.items()} | {"own": f"{own:.2f}"}
+                more = {"lr": lr, "kl_weight": kl, "own": own}
+                journal.write(trainer.updates, {"updates": trainer.updates} | row | more, line)
+    if journal.stop:
         print(f"stopped at {trainer.updates} updates; continue with: python -m drop train --resume --out {out}")
     return trainer
 
@@ -472,7 +462,7 @@ def detection(limit, recording, rng, n=500):
         C = C0.copy()
         if change is not None:
             joint, axis, degrees = body.J[change[0]], np.array(change[1], float), np.radians(change[2])
-            below = vae._ANCESTORS[:, joint] > 0
+            below = vae.ANCESTORS[:, joint] > 0
             parent = C0[:, body.PARENTS[joint]]
             rest = np.matmul(C0[:, below], np.swapaxes(C0[:, [joint]], -1, -2))  # descendants relative to the joint
             straight = vae.rotate_rows(np.eye(3), degrees * axis)  # the joint's turn as rows, Lᵀ of R = R_parent L

@@ -263,7 +263,7 @@ class LatentMLP(MLP):
             self.shapes[f"W{i}"], self.shapes[f"b{i}"] = (n_in + latent, n_out), (n_out,)
         self.n_params = sum(math.prod(s) for s in self.shapes.values())
         self.theta = np.zeros(self.n_params, dtype=dtype)
-        for i in range(self.n_layers):
+        for i in range(self.n_layers if rng else 0):  # as MLP: without rng zero, for weights that are read
             g = gain if i == self.n_layers - 1 else NN_ACTIVATIONS[self.activation][2]
             self.params[f"W{i}"][:] = orthogonal(*self.shapes[f"W{i}"], g, rng)
 
@@ -481,9 +481,9 @@ def networks(motion, pose):
 
 # ------------------------------------------------------------------------------------ noise
 
-_ANCESTORS = np.eye(N)
+ANCESTORS = np.eye(N)
 for _j in range(1, N):
-    _ANCESTORS[_j] += _ANCESTORS[PARENTS[_j]]
+    ANCESTORS[_j] += ANCESTORS[PARENTS[_j]]
 
 
 def disturbed(x, columns, v, rng, tilt=0.12, joint=0.10, height=0.03, push=0.3, share=0.7):
@@ -499,7 +499,7 @@ def disturbed(x, columns, v, rng, tilt=0.12, joint=0.10, height=0.03, push=0.3, 
     size = np.exp(rng.uniform(np.log(0.1), 0.0, b)) * (rng.random(b) < share)
     local = joint * rng.standard_normal((b, N, 3))
     local[:, 0] *= tilt / joint
-    angle = (size[:, None, None] * np.matmul(_ANCESTORS, local)).astype(t)
+    angle = (size[:, None, None] * np.matmul(ANCESTORS, local)).astype(t)
     C, _ = gram_schmidt_forward(columns)
     C = rotate_rows(C, angle)
     root = x[:, 0].copy()

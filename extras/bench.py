@@ -151,7 +151,7 @@ def policy_step(char, ref, policy, n=2000):
     times = []
     for _ in range(n):
         t = time.perf_counter()
-        env._observe(slice(None))
+        env.observe(slice(None))
         policy.mean_action(env.full[:, : env.obs_size])
         times.append(time.perf_counter() - t)
     return float(1e3 * np.percentile(times, 50)), float(1e3 * np.percentile(times, 99))

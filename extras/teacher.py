@@ -31,7 +31,7 @@ import mujoco
 import numpy as np
 
 import ppo
-from character import Character, joint_group, numberless
+from character import Character, driven_groups
 from env import Env
 from extras import train
 from nn import clip_grad_norm
@@ -57,10 +57,10 @@ def taught(char: Character, groups) -> np.ndarray:
     """The motors of groups of joints.  UserError: a group that the character has not
 
     Test      tests/extras/test_teacher.py::test_taught"""
-    names = [numberless(joint_group(char.hinges[h])) for h in char.driven]
-    if odd := set(groups) - set(names):
-        raise UserError(f"--joints {','.join(sorted(odd))}: valid: {', '.join(sorted(set(names)))}")
-    return np.flatnonzero(np.isin(names, list(groups)))
+    motors = driven_groups(char)
+    if odd := set(groups) - set(motors):
+        raise UserError(f"--joints {','.join(sorted(odd))}: valid: {', '.join(motors)}")
+    return np.array(sorted({motor for group in groups for motor in motors[group].tolist()}), int)
 
 
 def inertia(char: Character) -> np.ndarray:

@@ -27,7 +27,7 @@ import numpy as np
 import character
 import ppo
 import retarget
-from env import EPISODE_STEPS, ROOT_LIMIT, Env, Uniform, ablated, headset_only
+from env import EPISODE_STEPS, ROOT_LIMIT, WITHOUT, Env, Uniform, ablated, headset_only
 from extras import gpu
 from headset import body
 from mocap import augment, data
@@ -35,7 +35,7 @@ from mocap.rigs import Reading
 from plumbing.cli import NONNEGATIVE, POSITIVE, UNIT, UserError, arg, run_main
 from plumbing.files import atomic_write
 from plumbing.runs import fmt_time, load_checkpoint
-from plumbing.training import read_options
+from plumbing.training import read_options, say_idle
 from policy import initial, widths
 from retarget import Reference
 
@@ -224,7 +224,7 @@ def clips_of(opt: Options) -> list:
     for each in data.parts(opt.motion):  # as `data.sequences`, but the single clips are wanted, too, and read once
         say(f"reading {each}")
         found = data.load(each, clips=opt.clips, split="train", reading=reading)
-        made = found if len(found) == 1 else data._sequences(found, f"{each} [train]", opt.seed)
+        made = data.stitched(found, f"{each} [train]", opt.seed)
         single, clips, once = single + found, clips + made, set(map(id, found))
         runs += [c for c in made if id(c) not in once and augment.fastest_second(c) > RUNS]
     if opt.augment:
@@ -374,7 +374,9 @@ def make_env(opt: Options) -> Env:
     """The character, its motions, and the curriculum, as `ppo.make_env` without the last.
 
     Test      tests/extras/test_train.py::test_switches_reach_the_environment"""
-    char = ablated(opt.load(), opt.without, opt.track).solved_by(opt.solver)
+    whole = opt.load()
+    say_idle(whole, {name: WITHOUT[name] for name in opt.without})
+    char = ablated(whole, opt.without, opt.track).solved_by(opt.solver)
     ref = reference_of(opt, char)
     ref = headset_only(ref) if opt.sensors == "hmd" else ref
     added = {name: getattr(opt, name) for name in ("sensor_offset", "sensor_noise", "push")}

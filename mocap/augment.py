@@ -216,7 +216,7 @@ def lead(clip: Clip, still=1.5, rise=1.5, out=0.0) -> Clip:
     Args      still, rise, out : [s]; a clip too short for its rises gets shorter ones
     Returns   Clip; `measured` is the headset's height while it stands, which is what a stream is calibrated by
     Source    spec of the row `streamed`: 1.5 s each
-    Test      tests/mocap/test_mocap.py::test_lead
+    Test      tests/mocap/test_mocap.py::test_lead, test_lead_against_scipy
     """
     rate, last = clip.rate, len(clip) - 1.0
     rise = min(rise, 2.0 * last / rate / (2 if out else 1))

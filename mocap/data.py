@@ -25,8 +25,20 @@ import numpy as np
 
 from human import Clip, resample
 from mocap import bvh, gait
-from mocap.guess import _unknown
-from mocap.rigs import AS_IT_IS, FLOORS, HELP, REST_POSES, RIGS, _unit, canonical, from_amc, is_amc, known_rig, read
+from mocap.guess import unknown_rig
+from mocap.rigs import (
+    AS_IT_IS,
+    FLOORS,
+    HELP,
+    REST_POSES,
+    RIGS,
+    canonical,
+    checked_unit,
+    from_amc,
+    is_amc,
+    known_rig,
+    read,
+)
 from mocap.stitch import stitch
 from plumbing.cli import UserError, arg
 
@@ -210,15 +222,17 @@ def sequences(
     """
     if len(sets := parts(motion)) > 1:
         return [c for one in sets for c in sequences(one, split, clips, rate, seed, limit, verbose, reading)]
-    single = load(motion, rate, clips, split, reading)
+    return stitched(load(motion, rate, clips, split, reading), f"{motion} [{split}]", seed, limit, verbose)
+
+
+def stitched(single, title, seed=0, limit=0.15, verbose=True) -> list[Clip]:
+    """Single clips joined into sequences, with a line under the title: what `sequences` makes of one set.
+
+    Test      tests/mocap/test_mocap.py::test_sequences"""
     if len(single) == 1:
         if verbose:
-            print(f"{motion} [{split}] one clip, {single[0].seconds:.1f} s, as it is")
-        return single
-    return _sequences(single, f"{motion} [{split}]", seed, limit, verbose)
-
-
-def _sequences(single, title, seed=0, limit=0.15, verbose=True):
+            print(f"{title} one clip, {single[0].seconds:.1f} s, as it is")
+        return list(single)
     out, report = stitch(single, np.random.default_rng(seed), limit=limit)
     if verbose:
         result = str(report) if out else "too few to join: single clips are used"
@@ -290,6 +304,6 @@ def rig_for(b: bvh.Bvh, reading=AS_IT_IS, group=None):
     """
     known = None if reading.joint_map else known_rig(b)
     if not known:
-        return _unknown(b, group or [b], reading)
-    rig, unit, up = RIGS[known], _unit("--unit", reading.unit), reading.up
+        return unknown_rig(b, group or [b], reading)
+    rig, unit, up = RIGS[known], checked_unit("--unit", reading.unit), reading.up
     return replace(rig, unit=unit or rig.unit, up=up or rig.up), known

@@ -11,7 +11,20 @@ import numpy as np
 
 from human import FEET, PARENTS, SEG, SEGMENTS, linear_velocity, quat_conj, quat_rotate
 from mocap import bvh
-from mocap.rigs import RIGS, UPS, Rig, _frame, _from_file, _human, _pose, _unit, _up, find_unit, say, unit_line
+from mocap.rigs import (
+    RIGS,
+    UPS,
+    Rig,
+    axes_of,
+    checked_unit,
+    checked_up,
+    find_unit,
+    from_file_axes,
+    human_clip,
+    pose_of,
+    say,
+    unit_line,
+)
 from plumbing.cli import UserError, printable
 from plumbing.files import read_toml
 
@@ -214,8 +227,8 @@ def read_map(path):
         isinstance(balls, list) and len(balls) == 2 and all(isinstance(n, str) for n in balls)
     ):
         raise UserError(f"{path}: balls = {balls!r}; expected the names of two joints, left and right")
-    _unit(f"{path}: unit", table.get("unit"))
-    _up(f"{path}: up", table.get("up"))
+    checked_unit(f"{path}: unit", table.get("unit"))
+    checked_up(f"{path}: up", table.get("up"))
     return table
 
 
@@ -255,8 +268,10 @@ def _check_map(source, b, joints, balls):
 # ------------------------------------------------------------------------------------ how the axes stand
 
 
-def _unknown(b, group, reading):
-    """(Rig, name) for a file, and files of its skeleton, that is in no table."""
+def unknown_rig(b, group, reading):
+    """(Rig, name) for a file, and files of its skeleton, that is in no table.
+
+    Test      tests/mocap/test_rigs.py::test_any_rig"""
     table = read_map(reading.joint_map) if reading.joint_map else {}
     source = reading.joint_map or b.path
     given, ends = table.get("joints", {}), table.get("balls")
@@ -280,22 +295,22 @@ def _unknown(b, group, reading):
     if "head" not in given and "head" not in joints["head"].lower():
         say(b.path, f"no joint for the head: {joints['head']} is taken for it; another: --joint-map")
 
-    poses = [_pose(each) for each in group]
+    poses = [pose_of(each) for each in group]
     names = poses[0][0]
     at = [names.index(n) for n in (*joints.values(), *balls)]
-    up, unit = reading.up or table.get("up"), _unit("", reading.unit or table.get("unit"))
+    up, unit = reading.up or table.get("up"), checked_unit("", reading.unit or table.get("unit"))
     if not up:
         up, share = _of_all(b, group, lambda files, path: find_up(path, np.concatenate([p[:, at] for p in files])),
                             [p for _, p, _ in poses])  # fmt: skip
         say(b.path, f"{up} is up: the head is above the feet along it in {100 * share:.0f} % of the frames", False)
-    order, signs, _ = _from_file(up)
+    order, signs, _ = from_file_axes(up)
     pos = np.concatenate([p[:, at] for _, p, _ in poses])[..., order] * signs
     if not unit:
         unit, name, hips = find_unit(pos)
         say(b.path, unit_line(unit, name, hips), warning=not name)
     rig = Rig(joints, {}, balls, unit=unit, up=up)
     human = [
-        _human(rig, np.tile([1.0, 0, 0, 0], (15, 1)), *p, "", "", 1.0 / e.frame_time) for p, e in zip(poses, group)
+        human_clip(rig, np.tile([1.0, 0, 0, 0], (15, 1)), *p, "", "", 1.0 / e.frame_time) for p, e in zip(poses, group)
     ]
     fingers = [_fingers(b, rig, p) for p in poses]
     axes, notes = _of_all(b, group, lambda files, path: _measured(path, files), list(zip(human, fingers)))
@@ -347,7 +362,7 @@ def find_up(path, pos):
 def _fingers(b, rig, pose):
     """(T, 2, 3) where the hands point to: the mean of what hangs from the wrist, thumbs apart; NaN for nothing."""
     names, pos, _ = pose
-    order, signs, _ = _from_file(rig.up)
+    order, signs, _ = from_file_axes(rig.up)
     out = np.full((len(pos), 2, 3), np.nan)
     for k, hand in enumerate((rig.joints["hand_l"], rig.joints["hand_r"])):
         children = [j for j, p in enumerate(b.parents) if p >= 0 and b.names[p] == hand]
@@ -399,8 +414,8 @@ def measure(path, human, fingers):
         upright[:] = True
         notes.append("the trunk is upright in fewer than a tenth of the frames: head and trunk are measured in all")
     for segment in ("pelvis", "chest"):
-        axes[segment] = _frame(local(segment, across[segment], upright), local(segment, trunk, upright))
-    axes["head"] = _frame(local("head", across["chest"], upright), local("head", vertical, upright))
+        axes[segment] = axes_of(local(segment, across[segment], upright), local(segment, trunk, upright))
+    axes["head"] = axes_of(local("head", across["chest"], upright), local("head", vertical, upright))
 
     for k, side in enumerate("lr"):
         for upper, lower, end, sign, base in (
@@ -417,13 +432,13 @@ def measure(path, human, fingers):
                 joint = "knee" if base == "pelvis" else "elbow"
                 notes.append(f"{joint}_{side} hardly bends, or to all sides: its axis is that of hips or shoulders")
             axes[upper], axes[lower] = (
-                _frame(local(upper, bend), -local(upper, d1)),
-                _frame(local(lower, bend), -local(lower, d2)),
+                axes_of(local(upper, bend), -local(upper, d1)),
+                axes_of(local(lower, bend), -local(lower, d2)),
             )
         hand, forearm = f"hand_{side}", f"forearm_{side}"
         along = unit(fingers[:, k] - pos[:, SEG[hand]]) if np.isfinite(fingers[:, k]).all() else between(forearm, hand)
         left = quat_rotate(quat[:, SEG[forearm]], np.broadcast_to(axes[forearm][1], (len(quat), 3)))
-        axes[hand] = _frame(local(hand, left), -local(hand, along))
+        axes[hand] = axes_of(local(hand, left), -local(hand, along))
 
         foot, ankle = f"foot_{side}", pos[:, FEET[k]]
         speed = [
@@ -436,7 +451,7 @@ def measure(path, human, fingers):
             flat = low[0]
             notes.append(f"{foot} never stands: its sole is taken as level where the ankle is lowest")
         up, ahead = local(foot, vertical, flat), local(foot, ball[:, k] - ankle, flat)
-        axes[foot] = _frame(np.cross(up, ahead), up)
+        axes[foot] = axes_of(np.cross(up, ahead), up)
     return axes, [f"ASSUMED: {note}" for note in notes]
 
 

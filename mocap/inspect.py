@@ -9,7 +9,7 @@ from pathlib import Path
 
 from human import Clip, contacts, footfalls, resample, travelled
 from mocap import bvh, data, fetch, rigs
-from mocap.data import CONTROL_RATE, _sequences, load
+from mocap.data import CONTROL_RATE, load, stitched
 from mocap.rigs import AS_IT_IS, Reading, from_amc, is_amc
 from plumbing.cli import UserError, printable, run_main
 from plumbing.files import atomic_write, check_folders
@@ -83,7 +83,7 @@ def _inspect_folder(path, reading):
     trained = [resample(clip, CONTROL_RATE) for clip in clips]
     for clip in trained:
         print(describe(clip))
-    _sequences(trained, f"{path} [all]")
+    stitched(trained, f"{path} [all]")
     own = [str(file) for file in files] or [clip.name for clip in clips]
     return {f: numbers(clip, [text for name, text in said if name == f]) for f, clip in zip(own, clips, strict=True)}
 

@@ -85,8 +85,10 @@ def _axis(a):
     return np.asarray(a, dtype=float) / np.linalg.norm(a)
 
 
-def _frame(left, up):
-    """(forward, left, up) from a left axis made orthogonal to up.  ValueError: there is no such axis"""
+def axes_of(left, up):
+    """(forward, left, up) from a left axis made orthogonal to up.  ValueError: there is no such axis
+
+    Test      tests/mocap/test_rigs.py::test_any_rig"""
     left, up = _axis(left), _axis(up)
     left = _axis(left - up * (left @ up))
     return np.cross(left, up), left, up
@@ -144,7 +146,7 @@ RIGS = {
             **_limbs(dict(
                 leg=(("y", "-z", "-x"), ("y", "-z", "-x")),
                 # the elbows' axis in the arms' frames, the mean of upper arm × forearm over the clip
-                arm=(_frame((0, 0.34, 0.94), "-x"), _frame((0, -0.38, 0.92), "-x")),
+                arm=(axes_of((0, 0.34, 0.94), "-x"), axes_of((0, -0.38, 0.92), "-x")),
                 foot=(("x", "-z", "y"), ("x", "-z", "y")),
             )),
         ),
@@ -175,8 +177,8 @@ class Reading:
     rest_pose: str | None = None
 
     def __post_init__(self):
-        _unit("--unit", self.unit)
-        _up("--up", self.up)
+        checked_unit("--unit", self.unit)
+        checked_up("--up", self.up)
         object.__setattr__(self, "rate", _rate("--rate", self.rate))
         for name, valid in (("floor", FLOORS), ("rest_pose", REST_POSES)):
             if (value := getattr(self, name)) not in (None, *valid):
@@ -200,8 +202,10 @@ HELP = {  # of the flags that every command with --motion has
 FLOORS, REST_POSES = ("level", "file"), ("drop", "keep")
 
 
-def _unit(where, value) -> float | None:
-    """Metres a unit."""
+def checked_unit(where, value) -> float | None:
+    """Metres a unit, of a name or a number.  UserError, beginning with `where`: neither
+
+    Test      tests/mocap/test_rigs.py::test_overrides"""
     if value is None or isinstance(value, str) and value in UNITS:
         return UNITS.get(value)
     try:
@@ -226,7 +230,10 @@ def _rate(where, value) -> float | None:
     return number
 
 
-def _up(where, value) -> str | None:
+def checked_up(where, value) -> str | None:
+    """The axis that points up.  UserError, beginning with `where`: no axis
+
+    Test      tests/mocap/test_rigs.py::test_overrides"""
     if value is not None and value not in UPS:
         raise UserError(f"{where} {value!r} is no axis; valid: {', '.join(UPS)}")
     return value
@@ -236,7 +243,7 @@ AS_IT_IS = Reading()
 
 
 @cache
-def _from_file(up: str):
+def from_file_axes(up: str):
     """File axes -> ours: (permutation, signs, the same turn as a quaternion).  A cyclic permutation puts the up axis
     last (from y up: x left, y up, z forward); an axis that points down is then turned over about ours x."""
     k = "xyz".index(up[-1])
@@ -450,7 +457,7 @@ def _lowest(clip):
     return np.percentile(clip.ball[..., 2].min(axis=1), 20)
 
 
-def _pose(b, root_offset="replace"):
+def pose_of(b, root_offset="replace"):
     """Names, positions and rotations of joints and, as JOINT.end, of End Sites.  File units and axes."""
     pos, quat = bvh.global_pose(b, root_offset)
     index = {n: j for j, n in enumerate(b.names)}
@@ -463,17 +470,17 @@ def _pose(b, root_offset="replace"):
 def _clip_of(b, rig, name, root_offset):
     calibrations = np.stack([rig.calibration(s) for s in SEGMENTS])
     if any(n.endswith(".end") for n in (*rig.joints.values(), *rig.balls)):
-        pose = _pose(b, root_offset)
+        pose = pose_of(b, root_offset)
     else:
         pose = (b.names, *bvh.global_pose(b, root_offset))
-    return _human(rig, calibrations, *pose, Path(b.path).stem, name, 1.0 / b.frame_time)
+    return human_clip(rig, calibrations, *pose, Path(b.path).stem, name, 1.0 / b.frame_time)
 
 
-def _human(rig, calibrations, names, pos, quat, clip, body, rate):
+def human_clip(rig, calibrations, names, pos, quat, clip, body, rate):
     """The canonical human in a file's joints (file units and axes)."""
     index = {n: i for i, n in enumerate(names)}
     cols = [index[rig.joints[s]] for s in SEGMENTS]
-    order, signs, turn = _from_file(rig.up)
+    order, signs, turn = from_file_axes(rig.up)
     p = pos[..., order] * (signs * rig.unit)
     q = quat_mul(turn, quat_mul(quat[:, cols], calibrations))
     joint_pos = p[:, cols].copy()
@@ -526,14 +533,14 @@ def cmu_rig(skeleton: amc.Skeleton) -> Rig:
         i = index[name]
         return Rotation.from_euler(skeleton.axis_orders[i], skeleton.axes[i]).apply([1.0, 0.0, 0.0])
 
-    axes = dict.fromkeys(("pelvis", "chest", "head"), _frame("x", "y"))
+    axes = dict.fromkeys(("pelvis", "chest", "head"), axes_of("x", "y"))
     for side, palm in (("l", "y"), ("r", "-y")):
         up = {s: -skeleton.directions[index[side + s]] for s in ("femur", "tibia", "humerus", "radius", "hand")}
         knee, elbow = hinge(f"{side}tibia"), -hinge(f"{side}radius")
-        axes[f"thigh_{side}"], axes[f"shin_{side}"] = _frame(knee, up["femur"]), _frame(knee, up["tibia"])
+        axes[f"thigh_{side}"], axes[f"shin_{side}"] = axes_of(knee, up["femur"]), axes_of(knee, up["tibia"])
         axes[f"foot_{side}"] = axes[f"shin_{side}"]
-        axes[f"upper_arm_{side}"], axes[f"forearm_{side}"] = _frame(elbow, up["humerus"]), _frame(elbow, up["radius"])
-        axes[f"hand_{side}"] = _frame(palm, up["hand"])
+        axes[f"upper_arm_{side}"], axes[f"forearm_{side}"] = axes_of(elbow, up["humerus"]), axes_of(elbow, up["radius"])
+        axes[f"hand_{side}"] = axes_of(palm, up["hand"])
     return Rig(CMU_BONES, axes, ("ltoes", "rtoes"), CMU_PITCH, INCH / skeleton.length)
 
 
@@ -551,12 +558,12 @@ def from_amc(path, reading=AS_IT_IS) -> Clip:
     s, motion = read_amc(path)
     try:
         rig = cmu_rig(s)
-        rig = replace(rig, unit=_unit("--unit", reading.unit) or rig.unit)
+        rig = replace(rig, unit=checked_unit("--unit", reading.unit) or rig.unit)
     except ValueError as e:
         raise UserError(f"{s.path}: the axes of its bones make no frame: {e}; expected CMU's bones") from None
     calibrations = np.stack([rig.calibration(segment) for segment in SEGMENTS])
     pose = amc.global_pose(s, motion)
-    clip = _human(rig, calibrations, s.names, *pose, Path(path).stem, "", reading.rate or AMC_RATE)
+    clip = human_clip(rig, calibrations, s.names, *pose, Path(path).stem, "", reading.rate or AMC_RATE)
     n = leading_rest(clip.pos) if reading.rest_pose != "keep" else 0
     if n:
         say(path, _dropped(n))

@@ -137,7 +137,7 @@ def _stitch_body(group, rng, seconds, limit, blend, stay, report):
             continue
         for c, a, b in parts:
             played[c][a : b + 1] += 1
-        sequences.append(_join([(group[c], a, b) for c, a, b in parts], blend, f"{group[start].name}+{len(parts) - 1}"))
+        sequences.append(join([(group[c], a, b) for c, a, b in parts], blend, f"{group[start].name}+{len(parts) - 1}"))
         report.joins += len(joins)
         report.distances += joins
     report.frames_used += sum(int((p > 0).sum()) for p in played)
@@ -145,8 +145,10 @@ def _stitch_body(group, rng, seconds, limit, blend, stay, report):
     return sequences
 
 
-def _join(parts, blend, name):
-    """Cross-fade (clip, first, last) parts: each is aligned at its entry with the frame where the last is left."""
+def join(parts, blend, name):
+    """Cross-fade (clip, first, last) parts: each is aligned at its entry with the frame where the last is left.
+
+    Test      tests/mocap/test_mocap.py::test_stitch_joins"""
     clip, a, b = parts[0]
     pos, quat, ball = ([x[a:b]] for x in (clip.pos, clip.quat, clip.ball))
     current = clip

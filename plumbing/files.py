@@ -178,7 +178,7 @@ def parse_json(text):
     def pairs(items):
         table = dict(items)
         if len(table) < len(items):
-            raise ValueError(f"key {_twice(name for name, _ in items)[:40]!r} is there twice; valid: once")
+            raise ValueError(f"key {twice(name for name, _ in items)[:40]!r} is there twice; valid: once")
         return table
 
     def finite(word):
@@ -210,7 +210,7 @@ def _check_nesting(tree):
         raise RecursionError
 
 
-def _twice(names):
+def twice(names):
     """The first of the names that is there again."""
     seen = set()
     return next(name for name in names if name in seen or seen.add(name))

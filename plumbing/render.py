@@ -304,7 +304,7 @@ def write_png(path, image):
     atomic_write(path, png_bytes(image))
 
 
-def _extra(name):
+def extra(name):
     """Import a module of the extra `view`."""
     try:
         return importlib.import_module(name)
@@ -321,8 +321,8 @@ def write_video(path, frames, fps=36):
     """
     if Path(path).suffix != ".mp4":
         raise UserError(f"cannot write video {path}: valid names end in .mp4")
-    _extra("imageio_ffmpeg")
-    imageio = _extra("imageio.v2")
+    extra("imageio_ffmpeg")
+    imageio = extra("imageio.v2")
     if not Path(path).absolute().parent.is_dir():
         raise UserError(f"cannot write {path}: give a folder that exists and is writable")
     count = 0
@@ -347,8 +347,8 @@ def plot_curves(path, files, keys, x="steps", labels=None):
     kind = Path(path).suffix[1:]
     if kind not in ("png", "pdf", "svg"):
         raise UserError(f"cannot write plot {path}: valid names end in .png, .pdf or .svg")
-    _extra("matplotlib")
-    figure = _extra("matplotlib.figure").Figure(figsize=(4.5 * len(keys), 3.2), layout="constrained")
+    extra("matplotlib")
+    figure = extra("matplotlib.figure").Figure(figsize=(4.5 * len(keys), 3.2), layout="constrained")
     panels = figure.subplots(1, len(keys), squeeze=False)[0]
     for file, label in zip(files, labels or [Path(f).absolute().parent.name for f in files], strict=True):
         table = read_metrics(file)

@@ -33,7 +33,7 @@ from pathlib import Path
 import numpy as np
 
 from plumbing.cli import UserError
-from plumbing.files import _twice, atomic_write, parse_json, parse_number, read_arrays, read_text
+from plumbing.files import atomic_write, parse_json, parse_number, read_arrays, read_text, twice
 
 CHECKPOINT, PREVIOUS, CONFIG, METRICS = "checkpoint.npz", "checkpoint.prev.npz", "config.json", "metrics.csv"
 
@@ -92,8 +92,8 @@ def git_state(folder=None):
 def check_run(out, resume=False):
     """Is a run there where one is to be resumed, and none where one is to start?  Call it before slow work.
 
-    Raises    UserError: a run is there already and resume is False; or none is there and resume is True, or its
-              metrics.csv cannot be continued
+    Raises    UserError: a run is there already and resume is False, or the folder cannot be made; or none is there and
+              resume is True, or its metrics.csv cannot be continued
     Test      tests/plumbing/test_runs.py::test_open_run, tests/robustness/test_fuzz.py::test_run_folders
     """
     out = Path(out)
@@ -104,6 +104,9 @@ def check_run(out, resume=False):
         raise UserError(f"{out} holds no run to resume: leave out --resume, or name a folder that has {CONFIG}")
     if resume and (out / METRICS).exists():
         _whole_lines(out / METRICS)
+    above = next(p for p in (out, *out.absolute().parents) if p.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise UserError(f"cannot create the run folder {out}: {above} is no folder that can be written to")
 
 
 def open_run(out, config, resume=False):
@@ -372,7 +375,7 @@ def read_metrics(path):
     header, rows = (lines[0], lines[1:]) if lines else ([], [])
     columns = {name: np.empty(len(rows)) for name in header}
     if len(columns) < len(header):
-        raise UserError(f"{path} line 1: column {_twice(header)[:40]!r} is there twice; valid: once each")
+        raise UserError(f"{path} line 1: column {twice(header)[:40]!r} is there twice; valid: once each")
     for i, row in enumerate(rows):
         for name, cell in zip(header, row, strict=True):
             try:
@@ -425,6 +428,72 @@ class Progress:
     def update(self, done, values):
         """Print that line."""
         print(self.line(done, values), file=self.stream or sys.stdout, flush=True)
+
+
+class Means:
+    """Means of the numbers that have come since the last line.
+
+    Test      tests/plumbing/test_runs.py::test_means"""
+
+    def __init__(self):
+        self.sums, self.count = {}, 0
+
+    def add(self, values):
+        """One more of each, a dict of name -> number; a name may be missing now and then."""
+        for name, value in values.items():
+            self.sums[name] = self.sums.get(name, 0.0) + value
+        self.count += 1
+
+    def take(self):
+        """name -> mean over all that were added; then it begins anew."""
+        means = {name: total / self.count for name, total in self.sums.items()}
+        self.sums, self.count = {}, 0
+        return means
+
+
+class Journal:
+    """What stands around a training loop: the run's folder, metrics.csv, progress, checkpoints, Ctrl-C.
+
+        with Journal(…) as journal:
+            while steps < total and not journal.stop:
+                …
+                journal.write(steps, row, line)
+
+    Args      out, config, resume : as `open_run`; rows : of the checkpoint that is continued, or None
+              save : function of the number of rows, writes a checkpoint: after a line where the last one is `seconds`
+                  old, and at the end unless an exception is the end
+    Test      tests/plumbing/test_runs.py::test_journal
+    """
+
+    def __init__(self, out, config, resume, rows, progress: Progress, save, seconds):
+        self.metrics = Metrics(open_run(out, config, resume) / METRICS, rows)
+        self.progress, self.save, self.seconds = progress, save, seconds
+        self.flag, self.saved = StopFlag(), time.monotonic()
+
+    @property
+    def stop(self):
+        """Has a signal asked for the end?"""
+        return self.flag.stop
+
+    def __enter__(self):
+        self.flag.__enter__()
+        return self
+
+    def write(self, done, row, line):
+        """One row of metrics.csv, one line of progress, and a checkpoint if it is time."""
+        self.metrics.append(row)
+        self.progress.update(done, line)
+        if time.monotonic() - self.saved >= self.seconds:
+            self.save(self.metrics.rows)
+            self.saved = time.monotonic()
+
+    def __exit__(self, error, *_):
+        try:
+            if error is None:
+                self.save(self.metrics.rows)
+        finally:
+            self.flag.__exit__()
+            self.metrics.close()
 
 
 def fmt_time(seconds):

@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import hashlib
 import importlib
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,17 @@ def fingerprint(array) -> str:
 
     Test      tests/test_ppo.py::test_fingerprint"""
     return hashlib.sha256(np.ascontiguousarray(array)).hexdigest()[:16]
+
+
+def say_idle(char, without: dict) -> None:
+    """A note on stderr where what is left out weighs nothing anyway: the run would be the same with it.
+
+    Args      char : a `character.Character`; without : name -> the terms of its reward
+    Test      tests/test_ppo.py::test_without_what_weighs_nothing"""
+    for name, terms in without.items():
+        if terms and not any(char.reward[term][0] for term in terms):
+            says = f"note: --without {name} changes nothing: {char.name}'s reward gives it no weight"
+            print(says, file=sys.stderr)
 
 
 def motions(ref) -> dict:

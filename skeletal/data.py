@@ -245,7 +245,7 @@ def read_rig(path, up="y", drop=()) -> Raw:
     if len(keep) < 3:
         raise UserError(f"{path}: {len(keep) - 1} bones are left; valid: a root and two bones or more")
     at = {j: i for i, j in enumerate(keep)}
-    order, signs, turn = rigs._from_file(up)
+    order, signs, turn = rigs.from_file_axes(up)
     quat = quat[:, keep].copy()
     quat[:, 0] = quat_mul(turn, q0)
     pos = pos[:, order] * signs
@@ -291,7 +291,7 @@ def _lowest(b, place, quat, up):
         if above >= 0:
             p[:, j] = p[:, above] + quat_rotate(g[:, above], p[:, j])
             g[:, j] = quat_mul(g[:, above], g[:, j])
-    order, signs, _ = rigs._from_file(up)
+    order, signs, _ = rigs.from_file_axes(up)
     return (p[..., order] * signs)[..., 2].min(axis=1)
 
 
@@ -408,7 +408,7 @@ def write_motion(path, m: Motion, s: Structure):
     above = np.array((0, *s.parents[1:]))
     quat = m.quat.copy()
     quat[:, 1:] = quat_mul(quat_mul(quat_conj(g[above[1:]]), m.quat[:, 1:]), g[1:])
-    order, signs, turn = rigs._from_file(s.up)
+    order, signs, turn = rigs.from_file_axes(s.up)
     quat[:, 0] = quat_mul(quat_conj(turn), quat_mul(m.quat[:, 0], g[0]))
     pos = np.empty_like(m.pos)
     pos[:, order] = m.pos * signs / s.unit

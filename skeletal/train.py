@@ -8,8 +8,7 @@ makes two families of characters from one (--motion).
 
 from __future__ import annotations
 
-import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +19,13 @@ from nn import Adam
 from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli, given_flags
 from plumbing.runs import (
     CHECKPOINT,
-    Metrics,
+    Journal,
+    Means,
     Progress,
-    StopFlag,
     check_run,
     git_state,
     latest_checkpoint,
     load_checkpoint,
-    open_run,
     rng_from_state,
     rng_state,
     save_checkpoint,
@@ -500,37 +498,24 @@ def train(argv) -> int:
     if opt.resume and (found := latest_checkpoint(out)):
         trainer.load(*found)
         rows = found[1]["rows"]
-    open_run(out, asdict(opt), opt.resume)
-    metrics = Metrics(out / "metrics.csv", rows)
-    progress = Progress(opt.steps, trainer.step_count, "steps")
 
-    def save():
-        meta = {"steps": trainer.step_count, "rows": metrics.rows, "rng": rng_state(trainer.rng)}
+    def save(rows):
+        meta = {"steps": trainer.step_count, "rows": rows, "rng": rng_state(trainer.rng)}
         meta |= {"variant": opt.variant, "root": "carried" if trainer.choices.carry_root else "decoded"}
         meta |= {"pool": opt.pool, "motions": origin, "domains": domain_meta(domains)}
         save_checkpoint(out / CHECKPOINT, trainer.arrays(), meta)
 
-    last, sums, count = time.monotonic(), {}, 0
-    try:
-        with StopFlag() as flag:
-            while trainer.step_count < opt.steps and not flag.stop:
-                for adam in trainer.adams:
-                    adam.lr = opt.lr * (1.0 - 0.9 * trainer.step_count / opt.steps)
-                for k, v in trainer.step().items():
-                    sums[k] = sums.get(k, 0.0) + v
-                count += 1
-                if trainer.step_count % 50 == 0 or trainer.step_count == opt.steps:
-                    row = {k: v / count for k, v in sums.items()}
-                    metrics.append({"step": trainer.step_count} | row)
-                    progress.update(trainer.step_count, {k: f"{v:.4g}" for k, v in row.items()})
-                    sums, count = {}, 0
-                    if time.monotonic() - last > 60 * opt.save_minutes:
-                        save()
-                        last = time.monotonic()
-            save()
-    finally:
-        metrics.close()
-    if flag.stop:
+    means, progress = Means(), Progress(opt.steps, trainer.step_count)
+    with Journal(out, opt, opt.resume, rows, progress, save, 60 * opt.save_minutes) as journal:
+        while trainer.step_count < opt.steps and not journal.stop:
+            for adam in trainer.adams:
+                adam.lr = opt.lr * (1.0 - 0.9 * trainer.step_count / opt.steps)
+            means.add(trainer.step())
+            if trainer.step_count % 50 == 0 or trainer.step_count == opt.steps:
+                row = means.take()
+                line = {k: f"{v:.4g}" for k, v in row.items()}
+                journal.write(trainer.step_count, {"step": trainer.step_count} | row, line)
+    if journal.stop:
         print(f"stopped at {trainer.step_count} steps; continue with: python -m skeletal train --resume --out {out}")
     return 0
 

@@ -43,7 +43,8 @@ REQUIRED = (
         "completed", "survival", "root_cm", "head_cm", "hands_cm", "joint_pos_cm", "head_deg", "joint_rot_deg",
         "sip_deg", "foot_slide_cm_s", "penetration_mm", "contact_agreement", "jitter_m_s3", "steps_per_m",
         "head_wobble_deg_s", "torque_rms", "saturation", "streamed", "own_slide_cm_s", "self_penetration_mm",
-        "spring_share", "fails_every_s", "first_failure_s",
+        "spring_share", "fails_every_s", "first_failure_s", "mpjpe_cm", "mpjve_cm_s",
+        "root_pe, hand_pe, upper_pe, lower_pe", "mpjre_deg", "jitter_km_s3", "success_phc", "success_height",
     )),
     *(f"DROP Eq. {k}" for k in range(1, 17)),
     *("DROP Algorithm 1", "DROP §7 rotations"), *(f"DROP §8.{k}" for k in (1, 2, 3, 4, 5, 7)),
@@ -203,6 +204,13 @@ def test_named_tests_exist():
     names = {n for row in rows(1) for n in quoted(row[3])}
     bad = sorted(filter(None, map(missing_test, names)))
     assert names and not bad, "\n".join(bad)
+
+
+def test_every_equations_test_is_named():
+    """tests/test_equations.py is to be read beside the paper: part 1 leads to each of its tests."""
+    named = {n for row in rows(1, "") for n in quoted(row[3])}
+    missing = [t for t in sorted(functions_in("test_equations.py")) if f"tests/test_equations.py::{t}" not in named]
+    assert not missing, f"REPRODUCE.md, part 1 does not name {missing}"
 
 
 # ------------------------------------------------------------------------------------ part 2
@@ -476,6 +484,37 @@ def test_imports_run_one_way(capsys):
                 bad.append(f"{path.relative_to(ROOT)}:{line}: {own} imports {name}")
     with capsys.disabled():
         print("\n" + "\n".join(f"  {k} < {', '.join(sorted(graph.get(k, ())))}" for k in RANK))
+    assert not bad, "\n".join(bad)
+
+
+LONGEST_FILE = {"ppo.py": 450, "env.py": 600}  # lines; of any other file 800
+
+
+def test_files_are_one_sitting():
+    """Nine files at the top, and none that a reader cannot bear."""
+    assert len(list(ROOT.glob("*.py"))) == 9
+    sizes = {str(p.relative_to(ROOT)): len(p.read_text(encoding="utf-8").splitlines()) for p in FILES}
+    bad = [f"{name}: {n} lines" for name, n in sizes.items() if n > LONGEST_FILE.get(name, 800)]
+    assert not bad, "\n".join(bad)
+
+
+def private_names_of(path: Path):
+    """(line, name) of every name with an underscore that a file takes from another module of ours."""
+    ours, modules = {m.split(".")[0] for m in MODULES}, {}
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.Import):
+            modules |= {a.asname or a.name: a.name for a in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in ours:
+            modules |= {a.asname or a.name: a.name for a in node.names}
+            yield from ((node.lineno, a.name) for a in node.names if re.match(r"_(?!_)", a.name))
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.Attribute) and re.match(r"_(?!_)", node.attr) and ast.unparse(node.value) in modules:
+            yield node.lineno, ast.unparse(node)
+
+
+def test_private_names_stay_at_home():
+    """A name that begins with an underscore is used in its own file alone."""
+    bad = [f"{p.relative_to(ROOT)}:{line}: {name}" for p in FILES for line, name in private_names_of(p)]
     assert not bad, "\n".join(bad)
 
 

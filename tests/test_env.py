@@ -181,7 +181,7 @@ def test_heading_invariance(char, clips, ref, rng, pitch):
     b.qvel[:, :3] = turn.apply(a.qvel[:, :3])  # the root's angular velocity is in its own frame
     for e in (a, b):
         e.batch.forward(None, STAGE_VEL)
-        e._observe(slice(None))
+        e.observe(slice(None))
     np.testing.assert_allclose(a.full, b.full, rtol=1e-5, atol=5e-5)
     action = rng.uniform(-1, 1, (N, 33))
     ta, tb = a.reward_terms(action), b.reward_terms(action)

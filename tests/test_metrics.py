@@ -6,13 +6,15 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation, Slerp
 from test_mocap import walk
 
 import character
 import metrics
 import retarget
 from env import too_far
-from human import heading, quat_about, quat_mul
+from human import PARENTS, SEGMENTS, heading, quat_about, quat_mul
 from metrics import Recording
 from mocap.data import load
 from plumbing.cli import UserError
@@ -23,6 +25,7 @@ KEYS = (  # spec: every key of every row
     "penetration_mm contact_agreement jitter_m_s3 human_jitter_m_s3 steps_per_m human_steps_per_m head_wobble_deg_s "
     "torque_rms saturation own_slide_cm_s self_penetration_mm self_penetration_share spring_share"
 ).split()
+FIELD = [k for k, *_ in metrics.FIELD]
 GROUPS = [f"spring_share.{g}" for g in ("ankle", "elbow", "head", "hip", "knee", "neck", "shoulder", "spine")]
 KEYS += GROUPS
 
@@ -63,6 +66,10 @@ def matrix(q):
     out = np.zeros(9)
     mujoco.mju_quat2Mat(out, np.asarray(q, float))
     return out.reshape(3, 3)
+
+
+def rotation_of(q):
+    return Rotation.from_quat(q, scalar_first=True)
 
 
 def resting_pairs(char):
@@ -195,10 +202,72 @@ def test_metrics_against_slow_loop(char, ref):
     expected |= dict(clips=3, steps_per_m=falls / walked, human_steps_per_m=human_falls / human_walked)
     expected["completed"] = np.mean([not r.failed for r in recordings])
     expected["survival"] = np.mean([(len(r.frames) - 1) / (b - a) for r, a, b in zip(recordings, ref.first, ref.last)])
-    assert set(found) == set(KEYS) == set(expected)
+    assert set(found) - set(FIELD) == set(KEYS) == set(expected) and set(FIELD) < set(found)
     for key in KEYS:
         assert found[key] == pytest.approx(expected[key], rel=1e-5, abs=1e-5), key
         assert expected[key] > 0 or key == "completed", key
+
+
+def test_field_units_against_slow_loop(char, ref):
+    """One joint and one frame at a time: MuJoCo's poses, SciPy's splines and rotations."""
+    recordings, rng = metrics.kinematic(char, ref), np.random.default_rng(1)
+    for rec, aside in zip(recordings, (0.0, 0.1, 0.6)):  # one fails, one is held, one is too far away
+        rec.qpos = rec.qpos + np.append([0.0, aside, 0.0], np.zeros(rec.qpos.shape[1] - 3))
+        rec.qpos[:, 7:] += 0.05 * rng.standard_normal(rec.qpos[:, 7:].shape)
+    recordings[0].failed = True
+    found, m, data = metrics.measure(char, ref, recordings), char.model, mujoco.MjData(char.model)
+    body = {s: m.body("spine3" if s == "chest" else s).id for s in SEGMENTS}
+    rest = mujoco.MjData(m)
+    rest.qpos[2], rest.qpos[7:] = char.hip_height, char.default
+    mujoco.mj_forward(m, rest)
+    rests = {s: rotation_of(rest.xquat[b]) for s, b in body.items()}
+    sums, phc, height = {k: [] for k in FIELD}, [], []
+    for rec in recordings:
+        n, p, q = len(rec.frames), {s: [] for s in SEGMENTS}, {s: [] for s in SEGMENTS}
+        for qpos in rec.qpos:
+            data.qpos[:] = qpos
+            mujoco.mj_forward(m, data)
+            for s, b in body.items():
+                p[s].append(data.xpos[b].copy())
+                q[s].append((rotation_of(data.xquat[b]) * rests[s].inv()).as_quat())
+        truth = {s: ref.human_pos[rec.frames, i].astype(float) for i, s in enumerate(SEGMENTS)}
+        columns = ref.human_rot[rec.frames].astype(float)
+        t, fine = np.arange(n) / 30.0, np.arange(2 * n - 1) / 60.0
+        at = lambda x, t=t, fine=fine: make_interp_spline(t, np.array(x), k=3)(fine)  # noqa: E731
+        x, h = ({s: at(v[s]) for s in SEGMENTS} for v in (p, truth))
+        turns = {s: Slerp(t, Rotation.from_quat(q[s]))(fine) for s in SEGMENTS}
+        frames = np.concatenate([columns, np.cross(columns[..., 0], columns[..., 1])[..., None]], axis=-1)
+        wanted = {s: Slerp(t, Rotation.from_matrix(frames[:, i]))(fine) for i, s in enumerate(SEGMENTS)}
+        moved = {s: x[s] + h["head"] - x["head"] for s in SEGMENTS}
+        for i, s in enumerate(SEGMENTS):
+            off = [100 * np.linalg.norm(a - b) for a, b in zip(moved[s], h[s])]
+            sums["mpjpe_cm"] += off
+            legs = s == "pelvis" or s.startswith(("thigh", "shin", "foot"))
+            sums["lower_pe" if legs else "upper_pe"] += off
+            sums["root_pe"] += off if s == "pelvis" else []
+            sums["hand_pe"] += off if s.startswith("hand") else []
+            for f in range(1, len(fine)):
+                v, w = (60 * (k[s][f] - k[s][f - 1]) for k in (moved, h))
+                sums["mpjve_cm_s"].append(100 * np.linalg.norm(v - w))
+            for f in range(3, len(fine)):
+                third = x[s][f] - 3 * x[s][f - 1] + 3 * x[s][f - 2] - x[s][f - 3]
+                sums["jitter_km_s3"].append(np.linalg.norm(third) * 60**3 / 1000)
+            if i and not s.startswith("hand"):  # Jesse's hands have no joint
+                above = SEGMENTS[PARENTS[i]]
+                a, b = ((k[above].inv() * k[s]).as_rotvec() for k in (turns, wanted))
+                sums["mpjre_deg"] += list(np.degrees(np.abs(a - b)).ravel())
+        mean = np.mean([np.linalg.norm(x[s] - h[s], axis=1) for s in SEGMENTS], axis=0)
+        held = ("pelvis", "foot_l", "foot_r", "hand_l", "hand_r")
+        low = max(np.abs(x[s][:, 2] - h[s][:, 2]).max() for s in held)
+        facing = (turns["pelvis"].inv() * wanted["pelvis"]).magnitude().max()
+        phc.append(not rec.failed and mean.max() <= 0.5)
+        height.append(not rec.failed and low <= 0.25 and facing <= 1.0)
+    expected = {k: np.mean(v) for k, v in sums.items() if v}
+    expected |= {"success_phc": np.mean(phc), "success_height": np.mean(height)}
+    assert set(expected) == set(FIELD)
+    assert expected["success_phc"] == pytest.approx(1 / 3) and expected["success_height"] == pytest.approx(2 / 3)
+    for key in FIELD:
+        assert found[key] == pytest.approx(expected[key], rel=1e-4), key
 
 
 def test_metrics_of_kinematic(char, ref):
@@ -362,16 +431,18 @@ def test_nothing_to_measure(char, ref):
     one = Recording(rec.frames[:1], rec.qpos[:1], rec.contact[:1], rec.action[:1], True, 30)
     with np.errstate(all="raise"):
         row = metrics.measure(char, still_ref, [one])
-        assert row["completed"] == row["survival"] == 0.0 and row["root_cm"] == 0.0 and set(row) == set(KEYS)
+        assert row["completed"] == row["survival"] == 0.0 and row["root_cm"] == 0.0
+        assert set(row) == {*KEYS, *FIELD} and row["success_phc"] == row["success_height"] == 0.0
         steps = ("contact_agreement", "jitter_m_s3", "human_jitter_m_s3", "steps_per_m", "human_steps_per_m")
         steps += ("own_slide_cm_s", "foot_slide_cm_s", "head_wobble_deg_s", "torque_rms", "saturation", "spring_share")
+        steps += ("mpjve_cm_s", "jitter_km_s3")
         for key in (*steps, *GROUPS):
             assert np.isnan(row[key]), key
         for count in (2, 3):
             few = Recording(*(v[:count] for v in (rec.frames, rec.qpos, rec.contact, rec.action)), True, 30)
             assert np.isnan(metrics.measure(char, still_ref, [few])["jitter_m_s3"])
     json.loads(metrics.as_json({"policy": row}), parse_constant=lambda c: pytest.fail(c))
-    text = metrics.table({"policy": row})
+    text = metrics.report({"policy": row})
     assert "nan" not in text and "inf" not in text and "jitter - m/s³, - steps/m" in text
 
 
@@ -399,7 +470,11 @@ def test_sip_bodies(char):
 
 def test_table(char, ref):
     row = metrics.measure(char, ref, metrics.kinematic(char, ref))
-    text = metrics.table({"policy": row | {"fails_every_s": float("inf")}, "kinematic": row})
+    rows = {"policy": row | {"fails_every_s": float("inf")}, "kinematic": row}
+    text = metrics.report(rows)
+    ours, field, _ = text.split("\n\n")
+    assert ours == metrics.table(rows) and field == metrics.table(rows, metrics.FIELD)
+    assert [c.strip() for c in field.splitlines()[3].split("|")][1:3] == ["kinematic", f"{row['mpjpe_cm']:.1f}"]
     lines = text.splitlines()
     width = len(metrics.COLUMNS) + 1
     assert [line.count("|") for line in lines[:4]] == [width + 1] * 4
@@ -418,7 +493,9 @@ def test_comparison(char, ref):
     found, turned = (np.array([r for r in g if r[0] != "---"]) for g in (found, turned))
     np.testing.assert_array_equal(found, turned.T)
     assert found[3].tolist() == ["fails every s", "never", "-", "-"] and found[4, 0] == "first fails s"
-    assert metrics.comparison(results).splitlines()[-1] == metrics.table(results).splitlines()[-1]
+    ours, field, line = metrics.report(results, metrics.comparison).split("\n\n")
+    assert ours == metrics.comparison(results) and field == metrics.comparison(results, metrics.FIELD)
+    assert line == metrics.report(results).splitlines()[-1]
 
 
 def test_json():
@@ -458,7 +535,7 @@ def test_spring_share(char, ref):
     row = metrics.measure(char, still_ref, [replace(rec, qpos=bent, action=action)])
     assert row["spring_share.knee"] == pytest.approx(0.5) == row["spring_share"]
     assert metrics.measure(char, still_ref, [replace(rec, action=action)])["spring_share.knee"] == 0.0
-    groups = metrics.driven_groups(character.load("dino"))
+    groups = character.driven_groups(character.load("dino"))
     assert {"tail", "hip", "spine"} <= set(groups) and len(np.concatenate([*groups.values()])) == 37
 
 
@@ -466,7 +543,7 @@ def test_spring_share(char, ref):
 def test_self_penetration(name):
     """Nothing in the default pose; a forearm swung through the trunk is found, as deep as MuJoCo says."""
     char = character.load(name)
-    own, m = metrics.OwnShapes(char), char.model
+    own, m = character.OwnShapes(char), char.model
     rest = np.concatenate([[0, 0, char.hip_height], char.rest[char.root], char.default])
     assert own.overlap(rest[None])[0] == 0.0 and len(own.pairs) > 50
     through = np.tile(rest, (9, 1))
@@ -507,6 +584,7 @@ def test_streamed(char, ref):
     assert row["root_cm"] > 0 and row["jitter_m_s3"] < 1e5  # a stand is a jump, and no motion
     one = metrics.streamed(char, nothing, [stand])
     assert one["completed"] == 0.0 and set(one) == set(row)
+    assert row["success_phc"] == row["success_height"] == 0.0 and row["mpjpe_cm"] > 0
 
 
 def test_halves(ref):

@@ -121,6 +121,7 @@ def test_mlp(rng, name):
         np.testing.assert_allclose(row, h, rtol=1e-12)
     no_dx, dtheta = mlp.backward(dy, cache, want_dx=False)
     assert no_dx is None and np.array_equal(dtheta, mlp.backward(dy, cache)[1])
+    assert not nn.MLP(SIZES, name, None).theta.any()  # to be filled from a file
 
 
 def test_two_caches_do_not_share_memory(rng):

@@ -361,6 +361,7 @@ def two(tmp_path, monkeypatch):
     """Policies of two characters, one of them smaller and with the headset alone, and the clips they are shown."""
     clips = [data.load("builtin", clips=c)[0][:45] for c in ("walk_005", "stand_007")]
     monkeypatch.setattr(data, "sequences", lambda *_, **__: clips)
+    monkeypatch.setattr(data, "load", lambda *_, **__: list(clips))
     out = []
     for name, options in (("jesse", {"sensors": "hmd", "without": ["contact"]}), ("oppy", {"scale": 0.8})):
         char = character.load(name, scale=options.get("scale", 1.0))
@@ -382,7 +383,8 @@ def test_compare(two, tmp_path, capsys):
     assert f"{two[0]}: jesse, 1.5k steps, without contact, headset only" in text
     assert f"{two[1]}: oppy scale 0.8, 1.5k steps\n" in text
     lines = [line for line in text.splitlines() if line.startswith("|")]
-    assert lines[0].split("|")[2:6] == [f" {p} " for p in policies] and len(lines) == len(COLUMNS) + 2
+    assert lines[0].split("|")[2:6] == [f" {p} " for p in policies]
+    assert len(lines) == len(COLUMNS) + 2 + len(metrics.FIELD) + 2
     for path in two:
         play.main(["--policy", str(path), "--measure", "--json", str(out), *more])
         alone = json.loads(out.read_text())

@@ -587,6 +587,32 @@ def test_line_of_progress(char, ref):
     assert t.line(stats | {"failures": 2, "time_to_failure": 1.5})["fails every"] == "1.50 s"
 
 
+@pytest.mark.parametrize("recipe", ["none", "character"])
+def test_out_is_checked_before_the_motion_is_read(recipe, tmp_path, monkeypatch):
+    """A folder that holds a run, or that cannot be made, is said at once: a large data set takes minutes."""
+    for name in ("load", "sequences"):
+        monkeypatch.setattr(data, name, lambda *_, **__: pytest.fail("the motion was read first"))
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / CONFIG).write_text("{}")
+    (tmp_path / "file").write_text("")
+    cases = {"old": "already holds a run", "file": "cannot create", "file/run": "cannot create", "new": "no checkpoint"}
+    for out, says in cases.items():
+        more = ["--init", str(tmp_path / "nothing.npz")] if out == "new" else []
+        with pytest.raises(UserError, match=says):
+            ppo.main(["--character", "jesse", "--recipe", recipe, "--out", str(tmp_path / out), *more])
+    assert not (tmp_path / "new").exists()  # nothing is made before the motion is read
+
+
+def test_without_what_weighs_nothing(capsys):
+    """Jesse's contact has weight 0: a note, on stderr; none where something is left out, or only the critic's part."""
+    opt = Options(clips="*stand*", envs=2, threads=1)
+    ppo.make_env(replace(opt, without=("contact", "action", "asymmetric")))
+    err = capsys.readouterr().err
+    assert err == "note: --without contact changes nothing: jesse's reward gives it no weight\n"
+    ppo.make_env(replace(opt, character="oppy", without=("contact",)))
+    assert "note" not in capsys.readouterr().err
+
+
 def test_switches_reach_the_environment():
     """Each flag, and the variant of the character, in the environment that is trained."""
     opt = Options(clips="*stand*", envs=3, threads=1)

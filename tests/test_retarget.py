@@ -19,6 +19,7 @@ from human import (
     contacts,
     headset_height,
     quat_about,
+    quat_angle,
     resample,
     sensors,
 )
@@ -195,6 +196,28 @@ def turned(tmp_path, rng):
     (tmp_path / "mini.xml").write_text(xml)
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     return character.load(tmp_path / "mini.toml"), quats
+
+
+@pytest.mark.parametrize("name", ["jesse", "oppy", "dino"])
+def test_as_human(name, clips):
+    """There and back: the kinematic pose's segments stand as the human's; joints are where MuJoCo has the bodies."""
+    char, clip = character.load(name, set=HORIZONTAL if name == "dino" else ()), clips[1]
+    m, shared = char.model, retarget.shared_segments(char)
+    names = {SEGMENTS[s]: m.body(b).name for s, b in shared.items()}
+    assert list(shared) == sorted(shared) and names == {s: BODY_OF.get(s, s) for s in SEGMENTS}
+    pose, ref = retarget.retarget(char, clip), retarget.reference(char, [clip])
+    frames = np.flatnonzero(~pose.clipped.any(axis=1))[::9]
+    assert len(frames) > 5
+    pos, quat = retarget.as_human(char, retarget.forward_kinematics(char, pose.qpos[frames]))
+    human, turns = retarget.human_of(ref, frames, shared)
+    for k, t in enumerate(frames):
+        d = posed(m, pose.qpos[t])
+        for i, (segment, body) in enumerate(shared.items()):
+            np.testing.assert_allclose(pos[k, i], d.xpos[body], atol=1e-9)
+            np.testing.assert_allclose(human[k, i], clip.pos[t, segment] * ref.scale[t], atol=1e-5)
+            assert quat_angle(turns[k, i], clip.quat[t, segment]) < 1e-3  # float32
+            if SEGMENTS[segment] in ALL_THREE + ("pelvis",):
+                assert quat_angle(quat[k, i], clip.quat[t, segment]) < 1e-5, SEGMENTS[segment]
 
 
 def test_rest_offset(clips, tmp_path, rng):

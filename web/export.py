@@ -25,7 +25,7 @@ from env import observation_terms
 from headset.reader import AXES, COLUMNS
 from human import Clip, sensors
 from mocap import gait
-from mocap.stitch import _join, motion_features
+from mocap.stitch import join, motion_features
 from nn import LEAKY_SLOPE
 from plumbing.cli import UserError, arg, cli
 from plumbing.files import atomic_write
@@ -179,7 +179,7 @@ def demonstration() -> Clip:
         parts.append((clip, entry, int(leave[a])))
         entry = int(enter[b])
     parts.append((clips[-1], entry, len(clips[-1]) - 1))
-    return _join(parts, blend, "demonstration")
+    return join(parts, blend, "demonstration")
 
 
 def as_csv(clip: Clip) -> str:

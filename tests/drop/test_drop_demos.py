@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drop import body, demos, simulator
+from drop import body, demos, momenta, pictures, simulator
 from drop.__main__ import main
 from drop.body import RADII, STEP, J, N
 from drop.prior import VaePrior, load_networks
@@ -128,7 +128,7 @@ def test_escape(stage):
 
 def test_cylinder_momenta(stage):
     """A rigid body turned with growing speed about its centre of mass: L̇ = I α, I by points that fill the bones."""
-    mass, inertia = demos.cylinder_inertia()
+    mass, inertia = momenta.cylinder_inertia()
     assert mass.sum() == pytest.approx(N)
     np.testing.assert_allclose(inertia, np.swapaxes(inertia, 1, 2), atol=1e-12)
     rest = np.tile([1.0, 0, 0, 0], (N, 1))
@@ -140,7 +140,7 @@ def test_cylinder_momenta(stage):
     turns = Rotation.from_rotvec(angle[:, None] * axis)
     x = np.array([r.apply(x0) for r in turns])
     quat = np.repeat(turns.as_quat(scalar_first=True)[:, None], N, axis=1)
-    b, com = demos.momenta_of_cylinders(x, quat)
+    b, com = momenta.momenta_of_cylinders(x, quat)
     whole = sum(m * (p @ p * np.eye(3) - np.outer(p, p)) + i for m, p, i in zip(mass, middle, inertia))
     np.testing.assert_allclose(b[0, 3:], whole @ axis * alpha, atol=2e-2)
     np.testing.assert_allclose(b[0, :3], 0.0, atol=1e-9)
@@ -160,20 +160,20 @@ def test_cylinder_momenta(stage):
 def test_root_wrench_of_motions(stage):
     """Standing needs next to none, walking little, a walk hung in the air the body's weight; both models agree."""
     walk, stand = stage.clips[0], stage.clips[3]
-    points, cylinders = (demos.root_wrench(walk[1][:90], walk[2][:90], c) for c in (False, True))
+    points, cylinders = (momenta.root_wrench(walk[1][:90], walk[2][:90], c) for c in (False, True))
     assert np.median(points) < 15 and np.corrcoef(points, cylinders)[0, 1] > 0.7
-    assert np.median(demos.root_wrench(stand[1][:60], stand[2][:60])) < 5
-    hung = demos.root_wrench(walk[1][:40] + [0, 0, 1], walk[2][:40])
+    assert np.median(momenta.root_wrench(stand[1][:60], stand[2][:60])) < 5
+    hung = momenta.root_wrench(walk[1][:40] + [0, 0, 1], walk[2][:40])
     assert abs(np.median(hung) / (N * 9.81) - 1) < 0.2
 
 
 def test_shapes_and_arrows(stage):
     _, state = stage.start(0.0)
-    shapes = demos.body_shapes(state.x, demos.COLOURS[0])
+    shapes = pictures.body_shapes(state.x, pictures.COLOURS[0])
     assert len(shapes) == N and isinstance(shapes[-1], render.Marker)
-    shaft, head = demos.arrow(np.array([0.0, 0, 1]), [0.0, 0, 100.0], (1, 0, 0, 1))
+    shaft, head = pictures.arrow(np.array([0.0, 0, 1]), [0.0, 0, 100.0], (1, 0, 0, 1))
     assert np.linalg.norm(head.end - [0, 0, 1]) < np.linalg.norm(shaft.start - [0, 0, 1]) <= 0.8
-    assert demos.arrow(np.zeros(3), np.zeros(3), (1, 0, 0, 1)) == []
+    assert pictures.arrow(np.zeros(3), np.zeros(3), (1, 0, 0, 1)) == []
 
 
 def test_contact_forces_are_drawn_above_the_floor(stage):
@@ -181,7 +181,7 @@ def test_contact_forces_are_drawn_above_the_floor(stage):
     sim, state = stage.start(1.2)
     for _ in range(10):
         state, found = sim.step(state, rng=np.random.default_rng(0))
-    shapes = demos.contact_arrows(found)
+    shapes = pictures.contact_arrows(found)
     assert shapes and found.forces[:, 2].max() > 50
     ends = np.array([p for s in shapes for p in (s.start, s.end)])
     assert ends[:, 2].min() > -0.01 and ends[:, 2].max() > 0.1
@@ -282,7 +282,7 @@ def test_wrench_limit_is_the_motions_own(stage):
     limits = [stage.start(v)[0].wrench_limit for v in (0.0, 1.2, 2.5)]
     assert limits[0] == limits[1] == simulator.WRENCH_LIMIT and 30 < limits[2] < 70
     _, x, quat = demos.pick_motion(stage.clips, 2.5)
-    own = demos.root_wrench(x[:240], quat[:240])
+    own = momenta.root_wrench(x[:240], quat[:240])
     assert np.mean(own < limits[2]) == pytest.approx(0.95, abs=0.01)
     assert stage.start(2.5, wrench_limit=20.0)[0].wrench_limit == 20.0
 
@@ -343,6 +343,7 @@ def all_clips():
 
 def test_the_tripped_stumble(all_clips, monkeypatch):
     """A walker pitches over the held foot, which it does not if Eq. 14 leaves a fifth of the torque; a runner falls."""
+    cut(monkeypatch, 120)
     leans = []
     for seed in range(3):
         walk = demos._trip(all_clips, np.random.default_rng(seed), 1.2)
@@ -409,10 +410,10 @@ def test_outputs_are_checked_first(monkeypatch, tmp_path):
             demos.main(["push", flag, str(path)])
 
 
-def test_command(monkeypatch, capsys, tmp_path):
+def test_command(stage, monkeypatch, capsys, tmp_path):
     """python -m drop DEMO: help, numbers, pictures, and one line for whatever is wrong."""
-    monkeypatch.setattr(demos, "BUILTIN", SHORT)
-    cut(monkeypatch, 12)
+    monkeypatch.setattr(demos, "motions", lambda opt: [(name, x[:130], q[:130]) for name, x, q in stage.clips])
+    cut(monkeypatch, 10)
 
     def run(*args):
         with pytest.raises(SystemExit) as end:

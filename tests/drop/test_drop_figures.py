@@ -177,7 +177,7 @@ def test_command(monkeypatch, capsys, tmp_path):
     csv_file, png = tmp_path / "e.csv", tmp_path / "e.png"
     args = ["energies", "--count", 1, "--frames", 104, "--csv", csv_file]
     try:
-        render._extra("matplotlib")
+        render.extra("matplotlib")
         args += ["--png", png]
     except UserError:
         png = None

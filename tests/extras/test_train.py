@@ -378,6 +378,11 @@ def test_damaged_cache(tmp_path, monkeypatch, capsys):
 # ------------------------------------------------------------------------------------ training
 
 
+def test_without_what_weighs_nothing(tmp_path, capsys):
+    train.make_env(replace(small(tmp_path / "a"), without=("contact",)))
+    assert "note: --without contact changes nothing: jesse's reward" in capsys.readouterr().err
+
+
 def test_switches_reach_the_environment(tmp_path):
     opt = small(tmp_path / "a")
     plain, again = train.make_env(opt), train.make_env(opt)

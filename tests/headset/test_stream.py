@@ -420,7 +420,8 @@ def test_frozen_sensor():
         assert guard.events[DEVICES[device], "frozen"] == 1
         assert guard.seconds[DEVICES[device], "frozen"] == pytest.approx(100 / 90 - 0.25, abs=0.05)
         assert steps(out, device) < 0.02 and guard.live(device)
-    still = [Sample(k / 90, standing()[0].pos, standing()[0].quat) for k in range(200)]
+    first = standing()[0]
+    still = [Sample(k / 90, first.pos, first.quat) for k in range(200)]
     assert not guarded(still)[1].events  # all still: nobody moved
 
 

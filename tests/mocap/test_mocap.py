@@ -10,6 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg
+from scipy.integrate import quad
+from scipy.interpolate import interp1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from human import (
@@ -482,13 +484,13 @@ def pieces(seed=0, n=12, body="a"):
 @pytest.fixture
 def parts_of(monkeypatch):
     """What stitch joins: a list of (clip, first frame, last frame) for each sequence, filled as it runs."""
-    seen, join = [], stitch._join
+    seen, join = [], stitch.join
 
     def spy(parts, blend, name):
         seen.append(parts)
         return join(parts, blend, name)
 
-    monkeypatch.setattr(stitch, "_join", spy)
+    monkeypatch.setattr(stitch, "join", spy)
     return seen
 
 
@@ -833,7 +835,7 @@ def test_inspect(tmp_path, capsys):
     assert " 0 footfalls  balls - cm up" in inspect.describe(data.replace(clip, pos=clip.pos + 1, ball=clip.ball + 1))
     inspect.main(["inspect", str(tmp_path)])
     out = capsys.readouterr().out
-    assert "walk_001" in out and " 30.0 Hz" in out and "single clips are used" in out
+    assert "walk_001" in out and " 30.0 Hz" in out and "one clip, 1.0 s, as it is" in out
     with pytest.raises(UserError, match="nowhere"):
         inspect.main(["inspect", str(tmp_path / "nowhere")])
 
@@ -1093,6 +1095,39 @@ def test_lead():
     assert np.isfinite(short.pos).all() and len(short) > 20
     assert augment.begins_in_motion(clip) and not augment.begins_in_motion(led)
     assert led[10:].still == 36 and led[60:].still == 0
+
+
+@pytest.mark.parametrize("out", [0.0, 1.0])
+def test_lead_against_scipy(out):
+    """Every frame of the led clip is the source's at τ(t), the integral of its speed: SciPy's quadrature and Slerp."""
+    clip, n, still = walk(4.0), 30, 46  # n : frames of the rise; it stands for 1.5 s and one frame
+    led, last = augment.lead(clip, 1.5, 1.0, out), len(clip) - 1
+    speed = lambda k: np.clip(k / n, 0.0, 1.0)  # noqa: E731, of the clip's time, k frames after it sets off
+    tau = lambda k: quad(speed, 0, k, points=[n] if k > n else None, epsabs=1e-13)[0]  # noqa: E731
+    begun = [(tau(k), speed(k)) for k in range(1, 2 * len(clip))]
+    if out:  # the same backwards: the end is a beginning, seen from there
+        ended = [(last - at, share) for at, share in begun if at < n / 2] + [(last, 0.0)]
+        begun = [(at, share) for at, share in begun if at <= last - n / 2]
+        rest = [(last, 0.0)] * round(out * 30)
+        at, share = np.array([(0.0, 0.0)] * still + begun + sorted(ended)[:-1] + [(last, 0.0)] + rest).T
+    else:
+        at, share = np.array([(0.0, 0.0)] * still + [b for b in begun if b[0] <= last + 1e-9]).T
+    at = np.minimum(at, last)
+    assert len(led) == len(at)
+    frames = np.arange(len(clip))
+    pos, ball = (interp1d(frames, x, axis=0)(at) for x in (clip.pos, clip.ball))
+    quat = [Slerp(frames, rot(clip.quat[:, s]))(at).as_quat(scalar_first=True) for s in range(len(SEGMENTS))]
+    wanted = augment.replace(clip, pos=pos, ball=ball, quat=np.stack(quat, axis=1))
+    legs = [SEG[f"{s}_{side}"] for s in ("thigh", "shin", "foot") for side in "lr"]
+    for part, same in ((slice(None), [s for s in range(len(SEGMENTS)) if s not in legs]), (share == 1.0, legs)):
+        assert len(at[part]) > 60
+        np.testing.assert_allclose(led.pos[part][:, same], wanted.pos[part][:, same], rtol=0, atol=1e-9)
+        signs = np.sign(np.sum(led.quat * wanted.quat, axis=-1, keepdims=True))  # q and −q are one rotation
+        np.testing.assert_allclose((signs * led.quat)[part][:, same], wanted.quat[part][:, same], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(led.ball[share == 1.0], wanted.ball[share == 1.0], rtol=0, atol=1e-9)
+    sets_off = slice(0, still + n)  # the legs, while its time is slower: planted by the rest
+    standing = augment.planted(wanted, 1.0 - share)
+    np.testing.assert_allclose(led.pos[sets_off], standing.pos[sets_off], rtol=0, atol=1e-9)
 
 
 def test_visits():

@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -386,6 +387,43 @@ def test_rng_state_is_exact(kind):
 def test_bad_rng_state(bad):
     with pytest.raises(UserError, match="PCG64"):
         runs.rng_from_state(bad)
+
+
+def test_means():
+    means = runs.Means()
+    for values in ({"a": 1.0, "b": 2.0}, {"a": 4.0}, {"a": 1.0, "b": 4.0}):
+        means.add(values)
+    assert means.count == 3 and means.take() == {"a": 2.0, "b": 2.0}
+    assert means.count == 0 and means.take() == {}
+
+
+def test_journal(tmp_path, capsys, monkeypatch):
+    """Rows, lines, checkpoints by the clock and at the end; a signal asks for the end; an error saves nothing."""
+    out, saved, now = tmp_path / "run", [], [100.0]
+    monkeypatch.setattr(runs.time, "monotonic", lambda: now[0])
+
+    def journal(resume, rows=None):
+        return runs.Journal(out, {"steps": 9}, resume, rows, runs.Progress(9), saved.append, 60)
+
+    before = signal.getsignal(signal.SIGTERM)
+    with journal(False) as j:
+        for step in range(1, 4):
+            now[0] += 40.0
+            j.write(step, {"step": step, "loss": step / 2}, {"loss": f"{step / 2}"})
+            assert len(runs.read_metrics(out / "metrics.csv")["step"]) == step  # at once
+        assert saved == [2] and not j.stop  # after 80 s, not after 40 and 120
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert j.stop
+    assert saved == [2, 3] and signal.getsignal(signal.SIGTERM) is before
+    assert j.metrics.file.closed and json.loads((out / "config.json").read_text())["config"] == {"steps": 9}
+    assert "3/9 steps  loss 1.5" in capsys.readouterr().out
+    with pytest.raises(ZeroDivisionError), journal(True, 2) as j:
+        j.write(3, {"step": 3, "loss": 7.0}, {})
+        raise ZeroDivisionError
+    assert saved == [2, 3] and j.metrics.file.closed and signal.getsignal(signal.SIGTERM) is before
+    np.testing.assert_array_equal(runs.read_metrics(out / "metrics.csv")["loss"], [0.5, 1.0, 7.0])
+    with pytest.raises(UserError, match="already holds a run"):
+        journal(False)
 
 
 def test_metrics_resume(tmp_path, capsys):
