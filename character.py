@@ -522,10 +522,10 @@ def by_group(values: dict, name: str, default=None):
 
 
 def joint_group(name: str) -> str:
-    """hip_l_y -> hip, spine0_y -> spine0: the name Table 4 uses, in lower case.
+    """hip_l_y -> hip, left_hip_y -> hip, spine0_y -> spine0: the name Table 4 uses, in lower case.
 
-    Test      tests/test_characters.py::test_tables"""
-    return name.split("_")[0]
+    Test      tests/test_characters.py::test_tables, ::test_weights_and_groups"""
+    return re.sub(r"^(left|right|l|r)_", "", name.lower()).split("_")[0]
 
 
 def numberless(name: str) -> str:

@@ -27,6 +27,7 @@ SAMPLE_RATE = 90.0  # Hz, of a stream without times
 LINE_LIMIT = 65536  # bytes
 UNREADABLE_LIMIT = 100  # unreadable lines in a row that end a live stream
 EMPTY = ("", "nan", "null", "none")
+KINDS = (".csv", ".bsor")  # of files; `headset.bsor` reads the other one
 STEPS, JUDGED = (0.0005, 0.1), 11  # s between two rows of a headset; steps by whose median a time column is judged
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}  # which are not ours
 
@@ -252,7 +253,7 @@ def is_live(path) -> bool:
     Test      tests/headset/test_stream.py::test_pipes"""
     if str(path) == "-":
         return True
-    valid = "a .csv file, a named pipe, or - for standard input"
+    valid = "a .csv or .bsor file, a named pipe, or - for standard input"
     try:
         kind = kind_of(path)
     except (OSError, ValueError) as error:
@@ -264,13 +265,13 @@ def is_live(path) -> bool:
 
 
 def files_of(path) -> list[Path]:
-    """The CSV files of a folder and below it, perhaps none; or the file itself.
+    """The recordings (.csv, .bsor) of a folder and below it, perhaps none; or the file itself.
 
     Test      tests/headset/test_stream.py::test_folder_of_recordings, tests/headset/test_body.py::test_recordings"""
     path = Path(path)
     if not path.is_dir():
         return [path]
-    return sorted(f for f in path.rglob("*") if f.suffix.lower() == ".csv" and f.is_file())
+    return sorted(f for f in path.rglob("*") if f.suffix.lower() in KINDS and f.is_file())
 
 
 def lines_of(path):
