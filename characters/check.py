@@ -49,7 +49,7 @@ def check(name) -> list[str]:
     if xml and hasattr(c, "xml") and not c.xml.samefile(xml):
         found.append(f"{c.path}: its model is {c.xml.name}, not {xml.name}")
     found += [str(character.fault(c, text)) for text in faults_of_entries(c)]
-    return list(dict.fromkeys([*found, *loose_hinges(c)]))
+    return list(dict.fromkeys([*found, *loose_hinges(c), *own_contacts(c)]))
 
 
 def tables_and_file(c, xml) -> list[str]:
@@ -125,6 +125,17 @@ def complaint(c, function, *args) -> list[str]:
         if error.obj is not c:
             raise
     return []
+
+
+def own_contacts(c):
+    """Shapes that would touch one another: contacts that cost time, and that no character of ours has."""
+    if not hasattr(c, "model"):
+        return
+    m = c.model
+    bodies = dict.fromkeys(m.body(m.geom_bodyid[g]).name for g in np.flatnonzero(m.geom_contype) if m.geom_bodyid[g])
+    if bodies:
+        says = f"the shapes of {', '.join(bodies)} would touch one another"
+        yield f'{c.xml}: {says}; valid: contype="0" conaffinity="1", so that they touch the floor alone'
 
 
 def faults_of_entries(c):

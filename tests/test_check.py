@@ -1,9 +1,16 @@
-"""`python -m characters.check` on characters with several mistakes each: it finds them all, and each is one line."""
+"""`python -m characters.check` on characters with several mistakes each: it finds them all, and each is one line.
 
+And on the two that characters/README.md works out: a doll, and a humanoid of Gymnasium's."""
+
+import re
+
+import numpy as np
 import pytest
-from test_characters import fourth
+from test_characters import fourth, readme
+from test_retarget import clip_of
 
 import character
+import retarget
 from characters import check
 from plumbing.cli import UserError
 
@@ -34,6 +41,7 @@ BROKEN = {  # what: (file, old text, new text, what a line says beside the file:
         (TOML, '"hand_r"] }', '"hand_r"], scale_z = "head" }', ("[sensors] scale_z", "'head'", '"headset"')),
     ],
     "motors": [
+        (XML, 'contype="0" conaffinity="1" density', 'conaffinity="1" density', ("touch one another", 'contype="0"')),
         (XML, '<motor joint="knee_l_y"/>', '<motor joint="nee_l_y"/>', ("a motor", "'nee_l_y'", "knee_l_y")),
         (XML, '<motor joint="hip_r_x"/>', '<motor joint="hip_r_y"/>', ("hinge of its own", "that of hip_r_y")),
         (XML, '<motor joint="head_y"/>', '<position joint="head_y"/>', ("plain <motor>", "-1 1", "that of head_y")),
@@ -151,3 +159,24 @@ def test_every_mistake(tmp_path, case):
     with pytest.raises(UserError) as error:
         character.load(path)
     assert any(str(error.value) == line for line in found), str(error.value)
+
+
+def test_humanoid_of_the_readme(tmp_path, monkeypatch):
+    """Gymnasium's humanoid.xml has many faults as it is; changed as the README says it has none, and can be posed."""
+    gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
+    monkeypatch.chdir(tmp_path)
+    section = re.search(r"^### A fifth one.*", readme(), re.M | re.S)[0]
+    [script], [tables] = (re.findall(rf"```{kind}\n(.*?)```", section, re.S) for kind in ("python", "toml"))
+    assets = re.search(r'"(envs/\S+humanoid.xml)"', script)[1]
+    (tmp_path / "bare.xml").write_bytes((character.Path(gymnasium.__file__).parent / assets).read_bytes())
+    bare = "\n".join(check.check(tmp_path / "bare.xml"))
+    wrong = "is not there", "not so right_shoulder1", "not so abdomen_y", "touch one another", "[sensors] has no sites"
+    for says in wrong:
+        assert says in bare, bare
+    exec(compile(script, "make.py", "exec"), {})
+    (tmp_path / "humanoid.toml").write_text(tables)
+    assert check.check(tmp_path / "humanoid.xml") == []
+    char, clip = character.load(tmp_path / "humanoid.toml"), clip_of("walk", 3.0)
+    report = retarget.artefacts(char, clip, retarget.retarget(char, clip))
+    assert report["limit_share"] < 0.01 and abs(report["float_mm"]) < 30
+    assert char.j == len(char.driven) == 25 and np.isclose(char.model.body_subtreemass[0], 40.3, atol=0.1)
