@@ -471,8 +471,8 @@ class Guard:
               0.1 s.  More than 0.1 s without a row: all are lost
     Hold      a lost headset stays where it was.  A lost controller keeps its place relative to the headset; after 1 s
               it sinks to hang beside the body (time constant 0.5 s)
-    Return    from the held to the true pose in 0.3 s, or at 2 m/s if that is longer; likewise a headset after a step
-              of more than 0.2 m between two rows
+    Return    from the held to the true pose in as long as it was lost, in 0.3 s at most, or at 2 m/s if that is
+              longer; in 0.3 s a headset after a step of more than 0.2 m between two rows, too
     Anchor    a headset that comes back, or moves between two rows, by more than 1 m has been teleported: the whole
               stream is then shifted and turned about the vertical, so that the headset goes on from where it was (its
               height only if that changed by more than 0.5 m)
@@ -596,7 +596,8 @@ class Guard:
                 if step:
                     self.events["head", "step"] += 1
                 track.held, track.mix = track.last, 0.0
-                track.pace = 1.0 / max(BLEND, np.linalg.norm(own[0] - track.held[0]) / CATCH_UP)
+                fade = BLEND if step else min(BLEND, max(t - track.since, 1e-6))
+                track.pace = 1.0 / max(fade, np.linalg.norm(own[0] - track.held[0]) / CATCH_UP)
             track.lost, track.good = None, true[0]
             track.mix = min(1.0, track.mix + dt * track.pace)
             track.last = own if track.mix >= 1.0 else blend(track.held, own, track.mix)
