@@ -74,22 +74,17 @@ def tables_and_file(c, xml) -> list[str]:
 
 def whole_model(c) -> list[str]:
     """The model, or what is left of it without the parts that no model can be made of; the floor."""
+    found = []
     try:
         spec = character.bare(c)
-        broken = list(mjcf.broken_parts(spec))
-        for _, mend in broken:
+        for says, mend in list(mjcf.broken_parts(spec)):
+            found.append(f"{c.xml}: {says}")
             if mend:
                 mend()
         c.model = mjcf.made(spec, c.xml)
-        more = []
     except UserError as error:
-        more = [str(error)]
-        if "broken" not in locals():
-            return more
-    found = [f"{c.xml}: {says}" for says, _ in broken] + more
-    if c.spec is None and hasattr(c, "model"):
-        found += skeleton(c) + complaint(c, character.floor, c)
-    return found
+        return [*found, str(error)]
+    return found if c.spec is not None else found + skeleton(c) + complaint(c, character.floor, c)
 
 
 def skeleton(c) -> list[str]:

@@ -58,6 +58,7 @@ BROKEN = {  # what: (file, old text, new text, what a line says beside the file:
          ("shoulder_r_x", "0.5 to -3", "smaller angle first")),
         (TOML, "[map]", "pose = { hip_y = -20.0, knee = 0.1 }\n[map]", ("[pose] hip_y", "-20.0", "radians")),
         (TOML, "pose = {", "pose = {", ("[pose]", "'knee'", "knee_l_y")),
+        (XML, 'name="hips" pos="0 0 0.6"', 'name="hips" pos="0 0 0.6" euler="0 0 1.57"', ("y axis of hips", "left")),
     ],
     "groups": [
         (TOML, "base = { default = 40.0 }", "base = { hip = 40.0, knee = 0, ankle = -5.0, spine = 40.0 }",
