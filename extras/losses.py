@@ -52,7 +52,9 @@ class Options(MotionFlags):
     """Whose policies, and on what."""
 
     clips: str = arg("walk*", "shell pattern on clip names")
-    characters: tuple[str, ...] = arg(("jesse", "oppy", "dino"), "names or .toml paths, with shipped policies")
+    characters: tuple[str, ...] = arg(
+        ("jesse", "oppy", "dino"), "names or .toml paths, the .npz beside it", check=(len, "one or more names")
+    )
     stream: str | None = arg(None, "a headset's recording, or a folder of them: a table of their own")
     seconds: float = arg(20.0, "how much of each capture, lead-in and calibration included", check=POSITIVE)
     most: int = arg(6, "captures of each set at most, the first by name", check=POSITIVE)
