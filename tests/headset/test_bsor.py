@@ -225,7 +225,8 @@ def test_folder_and_single_file(tmp_path, capsys):
     folder.mkdir()
     (folder / "a.csv").write_text("".join(to_csv(t, pos, quat, "unity")))
     raw = written(framed(Reader("f").read(to_csv(t, pos, quat, "unity"))))
-    saved(folder, raw, "b.BSOR"), saved(folder, raw[:-2000], "c.bsor")
+    saved(folder, raw, "b.BSOR")
+    saved(folder, raw[:-2000], "c.bsor")
     assert [f.name for f in files_of(folder)] == ["a.csv", "b.BSOR", "c.bsor"]
     flags = ["--character", "jesse", "--policy", str(policy), "--threads", "1", "--json", str(tmp_path / "o.json")]
     with pytest.raises(SystemExit) as end:
