@@ -226,10 +226,15 @@ def schema(c) -> dict:
     held = one_of([*motored, *map(numberless, motored)], "driven joint")
     driven = toml.any_case(one_of([*motored, *map(numberless, motored), "default"], "driven joint"))
     every = {g: {g, numberless(g), "default"} for g in motored}
+    return tables_of(body, site, sensor, weighted, held, driven, every, poses(c))
+
+
+def tables_of(body, site, sensor, weighted, held, driven, every, pose) -> dict:
+    """The tables, by readers of the names in them: every : what [torque.base] and the like must speak of."""
     return {
         "root": {"body": body, "scale_xy?": number_or(), "scale_z?": number_or("hip")},
         "map": Each(body, FOLLOWER),
-        "torque": {"base": Each(driven, positive, every), "scale": Each(driven, at_least_0)},
+        "torque": {"base": Each(driven, positive, every), "scale": Each(driven, positive)},
         "passive": {
             "stiffness": Each(driven, at_least_0, every),
             "damping": at_least_0,
@@ -246,7 +251,7 @@ def schema(c) -> dict:
         "feet": {"bodies": [body], "contact_sensors": [sensor]},
         "sensors": {"sites": [site], "scale_z?": number_or("hip", "headset")},
         "fall": {"bodies": [body]},
-        "pose": poses(c),
+        "pose": pose,
         "metrics": {"sip": [body]},
         "training": TRAINING,
     }
@@ -294,16 +299,22 @@ def mjcf_file(c):
 
 def model(c):
     """What is simulated: the variation, without the shapes that are only looked at, which cost time in every step."""
+    spec = bare(c)
+    with in_toml(c):
+        pose = toml.read(poses(c), ("pose",), c.spec.get("pose", {})) if "tail" in c.variant else {}
+    c.model = mjcf.compiled(varied(c, spec, pose), c.xml)
+
+
+def bare(c) -> mujoco.MjSpec:
+    """The MJCF without the shapes that are only looked at; its hinges, and those with motors, as the file has them."""
     spec = mjcf.read_mjcf(c.xml)
     hinge = mujoco.mjtJoint.mjJNT_HINGE
-    c.joints = [j.name for j in spec.joints if j.type == hinge and j.name]  # as the file has them, like the next
+    c.joints = [j.name for j in spec.joints if j.type == hinge and j.name]
     c.motored = {a.target for a in spec.actuators}
     for geom in list(spec.geoms):
         if geom.contype == 0 and geom.conaffinity == 0:
             spec.delete(geom)
-    with in_toml(c):
-        pose = toml.read(poses(c), ("pose",), c.spec.get("pose", {})) if "tail" in c.variant else {}
-    c.model = mjcf.compiled(varied(c, spec, pose), c.xml)
+    return spec
 
 
 def skeleton(c):
@@ -368,10 +379,14 @@ def stretch(m, default, hinges):
 
 def root(c):
     """The body of the free joint."""
-    c.root, free = table(c, "root")["body"], c.model.jnt_bodyid[0]
+    m, c.root = c.model, table(c, "root")["body"]
+    free = m.jnt_bodyid[np.argmax(m.jnt_type == mujoco.mjtJoint.mjJNT_FREE)]
     if c.root != free:
         names = [c.model.body(b).name for b in (c.root, free)]
         raise fault(c, f"[root] body = {names[0]!r} must be the body of the free joint, {names[1]!r}")
+
+
+NO_HEAD = "[map] has no body that follows the human's head; needed: one with to = 'head'"
 
 
 def joint_map(c):
@@ -383,7 +398,7 @@ def joint_map(c):
         c.mapped[c.chains[-1][1]] = True
         followers[said["to"]] = b
     if SEG["head"] not in followers:
-        raise fault(c, "[map] has no body that follows the human's head; needed: one with to = 'head'")
+        raise fault(c, NO_HEAD)
     c.head = followers[SEG["head"]]
 
 
@@ -391,7 +406,7 @@ def chain(c, b, said):
     """What a body of the joint map does: (body, hinges, axes, from, to, shares)."""
     m, name = c.model, c.model.body(b).name
     hinges = np.arange(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]) - 1
-    if b == m.jnt_bodyid[0] or not len(hinges):
+    if b == m.body_rootid[b] or not len(hinges):
         raise UserError(f"[map] body {name} has no hinge in {c.xml.name}; give one that has")
     axes = "".join("xyz"[np.argmax(np.abs(m.jnt_axis[1 + h]))] for h in hinges)
     shares = {a: said[a] for a in "xyz" if a in said}
@@ -404,9 +419,8 @@ def feet(c):
     """Bodies, soles, and where in the sensor data their normal forces are, left and right."""
     said, m = table(c, "feet"), c.model
     bodies, sensors = said["bodies"], said["contact_sensors"]
-    if len(bodies) != 2 or len(sensors) != 2:
-        found = f"{len(bodies)} and {len(sensors)}"
-        raise fault(c, f"[feet] needs two bodies and two contact_sensors (left, right), found {found}")
+    for says in (*miscounted({"feet": said}), *watched(m, bodies, sensors)):
+        raise fault(c, says)
     with in_toml(c):
         soles = [mjcf.collision_geoms(m, [b], "[feet] bodies") for b in bodies]
     if len(soles[0]) != len(soles[1]):
@@ -417,14 +431,47 @@ def feet(c):
     c.contact_adr = m.sensor_adr[sensors] + (m.sensor_dim[sensors] - 1)
 
 
+def miscounted(spec):
+    """Which of [feet] and [sensors] holds too many or too few names, a line each."""
+    feet, sites = spec.get("feet"), spec.get("sensors")
+    if isinstance(feet, dict):
+        found = [len(v) if isinstance(v := feet.get(k), list) else 0 for k in ("bodies", "contact_sensors")]
+        if found != [2, 2]:
+            found = f"{found[0]} and {found[1]}"
+            yield f"[feet] needs two bodies and two contact_sensors (left, right), found {found}"
+    if isinstance(sites, dict) and isinstance(sites.get("sites"), list) and len(sites["sites"]) != 3:
+        yield f"[sensors] needs three sites (head, left, right), found {len(sites['sites'])}"
+
+
+def watched(m, bodies, sensors):
+    """What is wrong with the sensors of the feet, a line each: their kinds, and which body they watch."""
+    kinds, bodies_too = mujoco.mjtSensor, (int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtObj.mjOBJ_XBODY))
+    for b, s in zip(bodies, sensors):
+        name, kind = m.sensor(s).name, kinds(m.sensor_type[s])
+        if kind not in (kinds.mjSENS_TOUCH, kinds.mjSENS_CONTACT):
+            what = kind.name.removeprefix("mjSENS_").lower()
+            yield f"[feet] contact_sensors: {name} is a sensor of {what}; valid: contact with the floor, or touch"
+        elif kind == kinds.mjSENS_CONTACT and m.sensor_reftype[s] in bodies_too and m.sensor_refid[s] != b:
+            seen = m.body(m.sensor_refid[s]).name
+            yield f"[feet] contact_sensors: {name} watches {seen}; valid: one that watches {m.body(b).name}"
+
+
+def facing(c):
+    """In the default pose the root looks along x."""
+    m, data = c.model, mujoco.MjData(c.model)
+    data.qpos[7:] = c.default
+    mujoco.mj_kinematics(m, data)
+    root = m.jnt_bodyid[0]
+    if not np.allclose(data.xmat[root].reshape(3, 3)[:, 1], [0, 1, 0], atol=1e-6):
+        text = f"the y axis of {m.body(root).name} must point to the left: the heading is found from it"
+        raise UserError(f"{c.xml}: {text}")
+
+
 def rest(c):
     """What the default pose is: the counterpart of a human who stands upright with hanging arms, facing x."""
     m, data = c.model, mujoco.MjData(c.model)
     data.qpos[7:] = c.default
     mujoco.mj_kinematics(m, data)
-    if not np.allclose(data.xmat[c.root].reshape(3, 3)[:, 1], [0, 1, 0], atol=1e-6):
-        text = f"the y axis of {m.body(c.root).name} must point to the left: the heading is found from it"
-        raise UserError(f"{c.xml}: {text}")
     lowest = geom_lowest(m, c.sole_geoms.ravel(), data.geom_xpos[None], data.geom_xmat[None]).min()
     c.rest, c.hip_height = data.xquat.copy(), float(data.xpos[c.root, 2] - lowest)
 
@@ -446,14 +493,18 @@ def links(c):
 
 def devices(c):
     """Where the character wears headset and controllers."""
-    c.sensor_sites = np.array(table(c, "sensors")["sites"], int)
-    if len(c.sensor_sites) != 3:
-        raise fault(c, f"[sensors] needs three sites (head, left, right), found {len(c.sensor_sites)}")
+    said = table(c, "sensors")
+    for says in miscounted({"sensors": said}):
+        raise fault(c, says)
+    c.sensor_sites = np.array(said["sites"], int)
 
 
 def fall(c):
     """[§3.6] What must not touch the floor."""
-    bodies = table(c, "fall")["bodies"]
+    bodies, feet = table(c, "fall")["bodies"], table(c, "feet")["bodies"]
+    if both := [c.model.body(b).name for b in bodies if b in feet]:
+        says = f"[fall] bodies has {', '.join(both)}, which [feet] stands on"
+        raise fault(c, f"{says}; valid: bodies that must not touch the floor")
     with in_toml(c):
         c.fall_geoms = mjcf.collision_geoms(c.model, bodies, "[fall] bodies")
 
@@ -469,8 +520,8 @@ def metrics(c):
 
 
 PARTS = (
-    entries, tables, mjcf_file, model, skeleton, floor, default_pose, torques, springs, root, joint_map, feet, rest,
-    rewards, links, devices, fall, training, metrics,
+    entries, tables, mjcf_file, model, skeleton, floor, default_pose, torques, springs, root, joint_map, feet, facing,
+    rest, rewards, links, devices, fall, training, metrics,
 )  # fmt: skip
 
 
@@ -522,10 +573,10 @@ def by_group(values: dict, name: str, default=None):
 
 
 def joint_group(name: str) -> str:
-    """hip_l_y -> hip, spine0_y -> spine0: the name Table 4 uses, in lower case.
+    """hip_l_y -> hip, left_hip_y -> hip, spine0_y -> spine0: the name Table 4 uses, in lower case.
 
-    Test      tests/test_characters.py::test_tables"""
-    return name.split("_")[0]
+    Test      tests/test_characters.py::test_tables, ::test_weights_and_groups"""
+    return re.sub(r"^(left|right|l|r)_", "", name.lower()).split("_")[0]
 
 
 def numberless(name: str) -> str:

@@ -1,6 +1,6 @@
 r"""Watch one policy: picture, video, viewer, BVH; on a motion or a headset's recording  [Reda23 §4].
 
-    python play.py --character jesse --stream FILE.csv | --stream -             a headset's recording, or a live one
+    python play.py --character jesse --stream FILE.csv (or .bsor) | --stream -  a headset's recording, or a live one
     python play.py --character jesse --stream FOLDER --json OUT                 many recordings, side by side
     python play.py --character jesse --motion FOLDER --png OUT | --video OUT    headless pictures
     python play.py --character jesse --motion FOLDER --bvh OUT                  what the character did, as BVH
@@ -35,8 +35,9 @@ import retarget
 from character import Character
 from env import EPISODE_STEPS, Env
 from headset import axes, calibration
+from headset.bsor import opened
 from headset.player import Pace, Player, drive, ride, stream_of
-from headset.reader import AXES, DEVICES, GAP, SAMPLE_RATE, Reader, arriving, files_of, is_live, lines_of
+from headset.reader import AXES, DEVICES, GAP, SAMPLE_RATE, arriving, files_of, is_live
 from human import heading, sensors
 from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_action, simulate
 from mocap.augment import resize
@@ -58,7 +59,7 @@ class StreamFlags:
     """The flags of every command that is driven by a headset: which, and how it is to be read."""
 
     stream: str | None = arg(
-        None, "drive the character with a headset's .csv file, a named pipe, or - for standard input"
+        None, "drive the character with a headset's .csv file, a .bsor replay, a named pipe, or - for standard input"
     )
     axes: str = arg(
         "auto", "axes of the stream; auto: what fits a person best (a live stream: unity)", choices=("auto", *AXES)
@@ -313,8 +314,7 @@ def follow(char: Character, policy, path, devices: int, opt, see, pace: Pace | N
     player = Player(char, policy.mean_action, force=push.force if push else None, devices=devices)
     check_fits(policy, player, path)
     source, said = source_of(char, opt.stream, read, opt)
-    reader = Reader("standard input" if opt.stream == "-" else opt.stream, strict=not live, devices=read)
-    samples = reader.read(lines_of(opt.stream))
+    reader, samples = opened(opt.stream, strict=not live, devices=read)
     if live:  # a file's axes were looked at before
         samples = watched(samples, axes.Watch(source.axes, source.grip, source.unit, tuple(source.order), read))
     print(*said, sep="\n", end="\n" if said else "", flush=True)
@@ -386,13 +386,13 @@ OF_FILE = ("seconds", "completed", "failures", "fails_every_s", "head_cm", "hand
 
 
 def recordings_of(path) -> list[Path]:
-    """The CSV files of a folder and below it, or the file itself.
+    """The recordings of a folder and below it, or the file itself.
 
     Raises    UserError: a folder without any
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
     files = files_of(path)
     if not files:
-        raise UserError(f"--stream {path}: a folder without recordings; valid: one that holds .csv files")
+        raise UserError(f"--stream {path}: a folder without recordings; valid: one that holds .csv or .bsor files")
     return files
 
 
@@ -421,9 +421,7 @@ def ticks_of(char: Character, path, devices: int, opt: Options):
     Raises    UserError: it cannot be read, or shows no headset for a second
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
     source, said = source_of(char, path, devices, opt)
-    reader, ticks = Reader(str(path), devices=devices), []
-    for sample in reader.read(lines_of(path)):
-        ticks += source.push(sample)
+    ticks = [tick for sample in opened(path, devices=devices)[1] for tick in source.push(sample)]
     if not ticks:
         raise UserError(f"{path}: {source.uncalibrated()}")
     if opt.axes != "auto" or source.axes != "unity":  # what was found otherwise, or does not fit
@@ -536,7 +534,7 @@ def check_options(opt: Options, argv) -> None:
     if opt.stream and opt.json and (opt.realtime or opt.push):
         raise UserError("--stream with --json plays as it is: leave out --push and --realtime")
     if opt.stream and opt.json and not many and is_live(opt.stream):
-        raise UserError("--json tells of recordings, not of a live stream; valid: a .csv file or a folder of them")
+        raise UserError("--json tells of recordings, not of a live stream; valid: a .csv or .bsor file, or a folder")
     parse_push(opt.push)
     check_folders(opt.json, opt.png, opt.video, opt.bvh, read=(*mocap.data.parts(opt.motion), opt.stream, opt.policy))
 

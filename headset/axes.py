@@ -23,7 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from headset.reader import AXES, DEVICES, GRIP, UNIT, Reader, Sample, is_live, lines_of, to_world
+from headset.bsor import is_replay, opened
+from headset.reader import AXES, DEVICES, GRIP, UNIT, Sample, is_live, to_world
 from human import heading, quat_matrix, quat_rotate
 from plumbing.cli import UserError
 
@@ -274,7 +275,7 @@ def beginning(path, devices=3, seconds=SECONDS[1]) -> list[Sample]:
     Raises    UserError: as `Reader`
     Test      tests/headset/test_axes.py::test_choose"""
     out, first = [], None
-    for k, sample in enumerate(Reader(str(path), devices=devices).read(lines_of(path))):
+    for k, sample in enumerate(opened(path, devices=devices)[1]):
         if np.isfinite(sample.pos[0]).all() and sample.quat[0].any():
             first = sample.t if first is None else first
             out.append(sample)
@@ -293,12 +294,13 @@ def lie(samples) -> bool:
 def choose(path, wanted="auto", grip=None, unit=None, order=(0, 1, 2), devices=3) -> Choice:
     """How to read a stream: as wanted, with complaints about what does not fit; or, for "auto", as fits best.
 
-    A live stream cannot be read twice: for it "auto" is Unity's axes, and `Watch` complains as it goes on.
+    A live stream cannot be read twice: for it "auto" is Unity's axes, and `Watch` complains as it goes on.  A replay's
+    axes are known: Unity's.
     Args      grip, unit, order : what the user gave, or None; they count
     Test      tests/headset/test_axes.py::test_choose"""
     if wanted != "auto" and wanted not in AXES:
         raise UserError(f"--axes {wanted}: unknown; valid: auto, {', '.join(AXES)}")
-    if is_live(path):
+    if is_live(path) or wanted == "auto" and is_replay(path):
         return Choice("unity" if wanted == "auto" else wanted, grip, unit, tuple(order), [])
     samples = beginning(path, devices)
     if devices == 3 and lie(samples):  # until somebody takes them

@@ -12,8 +12,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from headset.bsor import opened
 from headset.calibration import Resampler, standing_height
-from headset.reader import Clock, Guard, Reader, Sample, files_of, lines_of, to_world
+from headset.reader import Clock, Guard, Sample, files_of, to_world
 from human import SEG, SEGMENTS, SENSOR_OFFSETS, Clip, heading, quat_about, quat_continuous, quat_matrix, quat_rotate
 from mocap.data import CONTROL_RATE
 from mocap.gait import Body, smooth, two_bone_leg
@@ -34,7 +35,7 @@ def read_recording(path, axes="unity", grip=None) -> tuple[np.ndarray, np.ndarra
     Raises    UserError: it cannot be read, or shows no headset
     Test      tests/headset/test_body.py::test_recordings"""
     clock, guard, resampler, ticks = Clock(), Guard(), Resampler(CONTROL_RATE), []
-    for sample in Reader(str(path)).read(lines_of(path)):
+    for sample in opened(path)[1]:
         t = clock.stamp(sample.t)
         if t is not None:
             for good in guard.push(Sample(t, *to_world(sample.pos, sample.quat, axes, grip))):
@@ -181,5 +182,6 @@ def players(folder, axes="unity") -> list[Clip]:
         except UserError as error:
             print(f"left out: {error}")
     if not out:
-        raise UserError(f"{folder}: no recordings; valid: a folder of .csv files that `play.py --stream` reads")
+        valid = "a folder of .csv or .bsor files that `play.py --stream` reads"
+        raise UserError(f"{folder}: no recordings; valid: {valid}")
     return out

@@ -29,7 +29,7 @@ from character import Character, geom_lowest
 from env import BAD, FORCE_LIMIT, SUBSTEPS, fallen, observation_terms, observe, slices_of
 from headset.calibration import Stream
 from headset.reader import Sample
-from human import heading, place, quat_about, quat_matrix, quat_rotate, sensors
+from human import Clip, heading, place, quat_about, quat_matrix, quat_rotate, sensors
 from mocap.augment import begins_in_motion, lead
 from mocap.data import CONTROL_RATE
 from retarget import HEADSET_AHEAD, STAGE_VEL, standing
@@ -227,21 +227,28 @@ def _ride(char, act, streams, devices, threads) -> list[Ride]:
 STANDS, SETS_OFF, CAPTURE = 1.5, 1.5, 20.0  # s of a streamed capture: still, speeding up, of itself at most
 
 
+def recorded(clip) -> tuple[list[Sample], Clip]:
+    """A headset's recording of a clip with its lead-in (`mocap.augment.lead`; no speeding up where it begins still).
+
+    Returns   samples as a file's reader gives them, axes "mujoco"; the clip with its lead-in
+    Test      tests/test_metrics.py::test_streamed"""
+    whole = clip[: round(CAPTURE * clip.rate) + 1]
+    led = lead(whole, STANDS, SETS_OFF if begins_in_motion(whole) else 0.0)
+    pos, quat = sensors(led)
+    return [Sample(k / clip.rate, pos[k], np.roll(quat[k], -1, axis=-1)) for k in range(len(led))], led
+
+
 def stream_of(char: Character, clip, devices=3):
     r"""What a headset's recording of a clip makes of it: poses at the control rate, and the human where they are.
 
-    Method    the clip with its lead-in (`mocap.augment.lead`; no speeding up where it begins still), its devices as
-              samples through `headset.calibration.Stream`, as a file's are; the calibrating second is not played
+    Method    `recorded` samples through `headset.calibration.Stream`, as a file's are; the calibrating second is not
+              played
     Returns   pos (T, 3, 3), quat (T, 3, 4) in the character's world; the clip in the same world, T frames; scale (3,)
     Test      tests/test_metrics.py::test_streamed
     """
-    whole = clip[: round(CAPTURE * clip.rate) + 1]
-    led = lead(whole, STANDS, SETS_OFF if begins_in_motion(whole) else 0.0)
     stream = Stream(char, "mujoco", rate=clip.rate, devices=devices)
-    pos, quat = sensors(led)
-    ticks = []
-    for k in range(len(led)):
-        ticks += stream.push(Sample(k / clip.rate, pos[k], np.roll(quat[k], -1, axis=-1)))
+    samples, led = recorded(clip)
+    ticks = [tick for sample in samples for tick in stream.push(sample)]
     c = stream.calibration
     seen = place(led, -c.yaw, c.origin[:2], np.zeros(2))[len(led) - len(ticks) :]
     return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks]), seen, c.scale

@@ -27,6 +27,7 @@ SAMPLE_RATE = 90.0  # Hz, of a stream without times
 LINE_LIMIT = 65536  # bytes
 UNREADABLE_LIMIT = 100  # unreadable lines in a row that end a live stream
 EMPTY = ("", "nan", "null", "none")
+KINDS = (".csv", ".bsor")  # of files; `headset.bsor` reads the other one
 STEPS, JUDGED = (0.0005, 0.1), 11  # s between two rows of a headset; steps by whose median a time column is judged
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}  # which are not ours
 
@@ -252,7 +253,7 @@ def is_live(path) -> bool:
     Test      tests/headset/test_stream.py::test_pipes"""
     if str(path) == "-":
         return True
-    valid = "a .csv file, a named pipe, or - for standard input"
+    valid = "a .csv or .bsor file, a named pipe, or - for standard input"
     try:
         kind = kind_of(path)
     except (OSError, ValueError) as error:
@@ -264,13 +265,13 @@ def is_live(path) -> bool:
 
 
 def files_of(path) -> list[Path]:
-    """The CSV files of a folder and below it, perhaps none; or the file itself.
+    """The recordings (.csv, .bsor) of a folder and below it, perhaps none; or the file itself.
 
     Test      tests/headset/test_stream.py::test_folder_of_recordings, tests/headset/test_body.py::test_recordings"""
     path = Path(path)
     if not path.is_dir():
         return [path]
-    return sorted(f for f in path.rglob("*") if f.suffix.lower() == ".csv" and f.is_file())
+    return sorted(f for f in path.rglob("*") if f.suffix.lower() in KINDS and f.is_file())
 
 
 def lines_of(path):
@@ -470,8 +471,8 @@ class Guard:
               0.1 s.  More than 0.1 s without a row: all are lost
     Hold      a lost headset stays where it was.  A lost controller keeps its place relative to the headset; after 1 s
               it sinks to hang beside the body (time constant 0.5 s)
-    Return    from the held to the true pose in 0.3 s, or at 2 m/s if that is longer; likewise a headset after a step
-              of more than 0.2 m between two rows
+    Return    from the held to the true pose in as long as it was lost, in 0.3 s at most, or at 2 m/s if that is
+              longer; in 0.3 s a headset after a step of more than 0.2 m between two rows, too
     Anchor    a headset that comes back, or moves between two rows, by more than 1 m has been teleported: the whole
               stream is then shifted and turned about the vertical, so that the headset goes on from where it was (its
               height only if that changed by more than 0.5 m)
@@ -595,7 +596,8 @@ class Guard:
                 if step:
                     self.events["head", "step"] += 1
                 track.held, track.mix = track.last, 0.0
-                track.pace = 1.0 / max(BLEND, np.linalg.norm(own[0] - track.held[0]) / CATCH_UP)
+                fade = BLEND if step else min(BLEND, max(t - track.since, 1e-6))
+                track.pace = 1.0 / max(fade, np.linalg.norm(own[0] - track.held[0]) / CATCH_UP)
             track.lost, track.good = None, true[0]
             track.mix = min(1.0, track.mix + dt * track.pace)
             track.last = own if track.mix >= 1.0 else blend(track.held, own, track.mix)

@@ -408,7 +408,8 @@ def measure(path, human, fingers):
     across["chest"] = between("upper_arm_r", "upper_arm_l")
     toes = unit((ball - pos[:, FEET]).mean(axis=1))
     if np.mean(np.sum(toes * np.cross(across["pelvis"], trunk), axis=-1)) < 0:
-        raise UserError(f"{path}: the toes point backwards: left and right are swapped in the joint map or mirrored")
+        valid = "toes that point where the left side is left of the right one"
+        raise UserError(f"{path}: the toes point backwards: left and right are swapped or mirrored; valid: {valid}")
     upright = trunk[:, 2] > np.cos(np.radians(30))
     if upright.mean() < 0.1:
         upright[:] = True

@@ -3,8 +3,10 @@ floor."""
 
 from __future__ import annotations
 
+import difflib
 import warnings
 from contextlib import contextmanager
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -37,13 +39,92 @@ def read_mjcf(xml) -> mujoco.MjSpec:
         return mujoco.MjSpec.from_file(str(xml))
 
 
+# ------------------------------------------------------------------------------------ before it is compiled
+
+TWICE = "valid: x, y and z once each"
+
+
+def broken_parts(spec: mujoco.MjSpec):
+    """What no model can be made of, or none of ours, part by part: a line, and a function that takes it out of the way.
+
+    A checker goes on with what is left; who loads stops at the first.
+    Test      tests/test_check.py::test_every_mistake"""
+    for body in spec.bodies:
+        hinges = [j for j in body.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE]
+        axes = ["xyz"[np.argmax(np.abs(j.axis))] for j in hinges]
+        if len(set(axes)) < len(axes):
+            says = f"body {body.name} has two hinges about one axis ({''.join(axes)}); {TWICE}"
+            yield says, partial(spread, hinges)
+        if body.explicitinertial and not body.mass > 0:
+            yield f"body {body.name} has a mass of {body.mass:g}; valid: kg, greater than 0", partial(lighten, body)
+        elif len(body.joints) and not has_mass(body):
+            says = f"body {body.name} moves, and has neither a shape that can collide nor a mass"
+            yield f"{says}; give it a geom of conaffinity 1, or <inertial>", partial(lighten, body)
+    for joint in spec.joints:
+        low, high = joint.range
+        if low >= high and (low or high):
+            yield f"the range of joint {joint.name} is {low:g} to {high:g}; valid: the smaller angle first", None
+    for geom in spec.geoms:
+        where = f"{'geom ' + geom.name if geom.name else 'a geom'} of body {geom.parent.name}"
+        heavy, text = ("mass", f"{geom.mass:g}") if np.isfinite(geom.mass) else ("density", f"{geom.density:g}")
+        if not getattr(geom, heavy) >= 0:
+            yield f"{where} has a {heavy} of {text}; valid: 0 or more", partial(setattr, geom, heavy, 1.0)
+    yield from unknown_targets(spec)
+
+
+def lighten(body):
+    """A kilogram in a body's place."""
+    body.explicitinertial, body.mass, body.inertia = True, 1.0, [0.01, 0.01, 0.01]
+
+
+def spread(hinges):
+    """Each about an axis of its own, as far as there are three."""
+    for hinge, axis in zip(hinges, np.eye(3), strict=False):
+        hinge.axis = axis
+
+
+def has_mass(body) -> bool:
+    """Whether a body, or one that is welded to it, has an inertia or shapes that give it one."""
+    welded = [b for b in body.bodies if not len(b.joints)]
+    return bool(body.explicitinertial or len(body.geoms)) or any(map(has_mass, welded))
+
+
+def unknown_targets(spec: mujoco.MjSpec):
+    """Motors and sensors of what is not there, as `broken_parts`."""
+    kinds = mujoco.mjtObj
+    named = {
+        kinds.mjOBJ_JOINT: spec.joints, kinds.mjOBJ_SITE: spec.sites, kinds.mjOBJ_GEOM: spec.geoms,
+        kinds.mjOBJ_BODY: spec.bodies, kinds.mjOBJ_XBODY: spec.bodies,
+    }  # fmt: skip
+    named = {kind: [item.name for item in items if item.name] for kind, items in named.items()}
+    for motor in spec.actuators:
+        joints = named[kinds.mjOBJ_JOINT]
+        if motor.trntype == mujoco.mjtTrn.mjTRN_JOINT and motor.target not in joints:
+            name = f"motor {motor.name}" if motor.name else "a motor"
+            says = f"{name} turns joint {motor.target!r}, which is not there; valid: {', '.join(joints)}"
+            yield says, partial(spec.delete, motor)
+    for sensor in spec.sensors:
+        for key in ("obj", "ref"):
+            kind, name = getattr(sensor, f"{key}type"), getattr(sensor, f"{key}name")
+            if kind in named and name not in named[kind]:
+                what, valid = kind.name.removeprefix("mjOBJ_").lower().removeprefix("x"), ", ".join(named[kind])
+                says = f"sensor {sensor.name} is of {what} {name!r}, which is not there; valid: {valid or 'none'}"
+                near = difflib.get_close_matches(name, named[kind], 1, 0.0)  # what was meant, presumably
+                yield says, partial(setattr, sensor, f"{key}name", near[0]) if near else partial(spec.delete, sensor)
+
+
+# ------------------------------------------------------------------------------------ the model
+
+
 def compiled(spec: mujoco.MjSpec, xml) -> mujoco.MjModel:
     """The model of an MJCF; no body has two hinges about one axis, and no size or mass is beyond any use."""
-    for body in spec.bodies:
-        axes = ["xyz"[np.argmax(np.abs(j.axis))] for j in body.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE]
-        if len(set(axes)) < len(axes):
-            text = f"body {body.name} has two hinges about one axis ({''.join(axes)}); valid: x, y and z once each"
-            raise UserError(f"{xml}: {text}")
+    for says, _ in broken_parts(spec):
+        raise UserError(f"{xml}: {says}")
+    return made(spec, xml)
+
+
+def made(spec: mujoco.MjSpec, xml) -> mujoco.MjModel:
+    """The model, as MuJoCo compiles it."""
     with told(xml):
         m = spec.compile()
     for name in "body_pos body_ipos body_mass body_inertia geom_pos geom_size jnt_pos jnt_range site_pos".split():
@@ -65,39 +146,89 @@ def hinges_of(m, xml):
     Returns   names : list of j; ranges (j, 2) [rad], infinite where a hinge has none
     Raises    UserError: other joints, a hinge without a name or about a slant axis, degrees
     Test      tests/test_characters.py::test_checks, ::test_unnamed_hinge"""
-    kinds = mujoco.mjtJoint
-    if m.njnt < 2 or m.jnt_type[0] != kinds.mjJNT_FREE or np.any(m.jnt_type[1:] != kinds.mjJNT_HINGE):
-        raise UserError(f"{xml}: the first joint must be free and all others hinges")
-    names = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_JOINT, k) for k in range(1, m.njnt)]
-    if None in names:
-        at = m.body(m.jnt_bodyid[1 + names.index(None)]).name
-        raise UserError(f"{xml}: every hinge needs a name, such as hip_l_y; one of body {at!r} has none")
-    slant = [n for n, axis in zip(names, m.jnt_axis[1:]) if not np.isclose(np.abs(axis).max(), 1.0)]
+    for says in hinge_faults(m):
+        raise UserError(f"{xml}: {says}")
+    return hinges_as_they_are(m)
+
+
+def hinges_as_they_are(m):
+    """Names and ranges of all joints but the first; "" where one has no name."""
+    names = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_JOINT, k) or "" for k in range(1, m.njnt)]
+    return names, np.where(m.jnt_limited[1:, None].astype(bool), m.jnt_range[1:], [-np.inf, np.inf])
+
+
+def hinge_faults(m):
+    """What is wrong with the joints of a model, line by line.
+
+    Test      tests/test_characters.py::test_checks, tests/test_check.py::test_every_mistake"""
+    kinds, (names, _) = mujoco.mjtJoint, hinges_as_they_are(m)
+    body = lambda k: m.body(m.jnt_bodyid[k]).name  # noqa: E731
+    rule = "the first joint must be free and all others hinges"
+    if m.njnt == 0 or m.jnt_type[0] != kinds.mjJNT_FREE:
+        root = m.body(m.body_rootid[m.jnt_bodyid[0]]).name if m.njnt else ""
+        yield f"{rule}; " + (f"body {root} has no free joint: give it <freejoint/>" if root else "there is none")
+    odd = [k for k in range(1, m.njnt) if m.jnt_type[k] != kinds.mjJNT_HINGE]
+    for k in odd:
+        kind = kinds(m.jnt_type[k]).name.removeprefix("mjJNT_").lower()
+        yield f"{rule}; joint {names[k - 1] or 'without a name'} of body {body(k)} is of type {kind}"
+    if m.njnt == 1:
+        yield f"{rule}; there are no hinges"
+    trees = list(dict.fromkeys(m.body(b).name for b in m.body_rootid[m.jnt_bodyid]))
+    if len(trees) > 1:
+        yield f"one body of the world may have joints, with all others in it; there are {', '.join(trees)}"
+    hinges = [k for k in range(1, m.njnt) if k not in odd]
+    for k in hinges:
+        if not names[k - 1]:
+            yield f"every hinge needs a name, such as hip_l_y; one of body {body(k)!r} has none"
+    slant = [names[k - 1] for k in hinges if not np.isclose(np.abs(m.jnt_axis[k]).max(), 1.0)]
     if slant:
-        rule = "every hinge must turn about one axis of its body's frame (x, y or z)"
-        raise UserError(f"{xml}: {rule}; not so {', '.join(slant)}")
-    limited = m.jnt_limited[1:].astype(bool)
-    widest = np.abs(m.jnt_range[1:])[limited].max(initial=0.0)
-    if limited.any() and widest < 0.1:
-        raise UserError(f"{xml}: joint ranges look like degrees read as radians; set <compiler angle='radian'/>")
-    if widest > 2 * np.pi:
-        worst = names[np.abs(m.jnt_range[1:]).max(axis=1).argmax()]
-        text = f"the range of hinge {worst} reaches {widest:.0f} rad: it looks like degrees; write radians"
-        raise UserError(f"{xml}: {text}")
-    return names, np.where(limited[:, None], m.jnt_range[1:], [-np.inf, np.inf])
+        yield f"every hinge must turn about one axis of its body's frame (x, y or z); not so {', '.join(slant)}"
+    yield from range_faults(m, [k for k in hinges if m.jnt_limited[k]], names)
+    for k in hinges:
+        for what, value in (("stiffness", m.jnt_stiffness[k]), ("damping", m.dof_damping[m.jnt_dofadr[k]])):
+            if np.any(value < 0):
+                yield f"hinge {names[k - 1]} has a {what} of {float(np.min(value)):g}; valid: 0 or more"
+
+
+def range_faults(m, hinges, names):
+    """Degrees."""
+    if hinges and np.abs(m.jnt_range[hinges]).max() < 0.1:
+        yield "joint ranges look like degrees read as radians; set <compiler angle='radian'/>"
+    for k in hinges:
+        far = np.abs(m.jnt_range[k]).max()
+        if far > 2 * np.pi:
+            yield f"the range of hinge {names[k - 1]} reaches {far:.0f} rad: it looks like degrees; write radians"
 
 
 def driven_of(m, xml) -> np.ndarray:
     """Hinge index of each motor of a model whose motors are plain: control -1 to 1 times a gear.
 
     Test      tests/test_characters.py::test_checks"""
-    driven = m.actuator_trnid[:, 0] - 1
-    if np.any(m.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT) or np.any(driven < 0) or len(set(driven)) < m.nu:
-        raise UserError(f"{xml}: every actuator must be a motor on a hinge of its own")
+    for says in motor_faults(m):
+        raise UserError(f"{xml}: {says}")
+    return m.actuator_trnid[:, 0] - 1
+
+
+def motor_faults(m):
+    """What is wrong with the motors of a model, line by line.
+
+    Test      tests/test_characters.py::test_checks, tests/test_check.py::test_every_mistake"""
+    driven = m.actuator_trnid[:, 0]
+    turns = m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    hinge = turns & (m.jnt_type[np.where(turns, driven, 0)] == mujoco.mjtJoint.mjJNT_HINGE)
+    again = np.array([driven[k] in driven[:k][hinge[:k]] for k in range(m.nu)], bool)
     plain = (m.actuator_gaintype == 0) & (m.actuator_biastype == 0) & (m.actuator_gainprm[:, 0] == 1)
-    if not plain.all() or np.any(m.actuator_ctrllimited & np.any(m.actuator_ctrlrange != [-1, 1], axis=1)):
-        raise UserError(f'{xml}: every actuator must be a plain <motor>, its ctrlrange "-1 1"')
-    return driven
+    plain &= ~(m.actuator_ctrllimited.astype(bool) & np.any(m.actuator_ctrlrange != [-1, 1], axis=1))
+
+    def names(ids):
+        found = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_ACTUATOR, k) for k in ids]
+        joint = lambda k: f"that of {m.joint(driven[k]).name}" if turns[k] else f"number {k}"  # noqa: E731
+        return ", ".join(name or joint(k) for name, k in zip(found, ids, strict=True))
+
+    rules = (~hinge | again, "motor on a hinge of its own"), (~plain, 'plain <motor>, its ctrlrange "-1 1"')
+    for wrong, rule in rules:
+        if wrong.any():
+            yield f"every actuator must be a {rule}; not so {names(np.flatnonzero(wrong))}"
 
 
 def check_floor(m, xml):

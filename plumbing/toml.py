@@ -94,14 +94,20 @@ def one_of(valid, what: str):
     """Reader of a name: the name itself, or what a table `valid` holds for it."""
 
     def reader(place, value):
-        if not isinstance(value, str):
-            raise UserError(f"{at(place)} = {value!r} is not a name (str)")
+        a_name(place, value)
         if value not in valid:
             there = ", ".join(dict.fromkeys(valid)) or "none"
             raise UserError(f"[{'.'.join(place[:-1])}] names {what} {value!r}; there are: {there}")
         return valid[value] if isinstance(valid, dict) else value
 
     return reader
+
+
+def a_name(place, value):
+    """Any name."""
+    if not isinstance(value, str):
+        raise UserError(f"{at(place)} = {value!r} is not a name (str)")
+    return value
 
 
 def any_case(reader):
@@ -128,14 +134,19 @@ def read(schema, place, value):
     if isinstance(schema, Each):
         check_table(place, value)
         found = {schema.name((*place, key), key): read(schema.value, (*place, key), v) for key, v in value.items()}
-        lacking = [what for what, keys in schema.needs.items() if not keys & set(found)]
-        if lacking:
-            raise UserError(f"[{'.'.join(place)}] has no {', '.join(lacking)}; valid: {', '.join(schema.needs)}")
+        check_needs(schema, place, found)
         return found
     if isinstance(schema, dict):
         check_keys(schema, place, value)
         return {key: read(kind_of_key(schema, key), (*place, key), v) for key, v in value.items()}
     return schema(place, value)
+
+
+def check_needs(schema: Each, place, keys):
+    """Nothing that must be there is missing."""
+    lacking = [what for what, some in schema.needs.items() if not some & set(keys)]
+    if lacking:
+        raise UserError(f"[{'.'.join(place)}] has no {', '.join(lacking)}; valid: {', '.join(schema.needs)}")
 
 
 def kind_of_key(schema: dict, key):

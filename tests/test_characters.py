@@ -92,7 +92,8 @@ def test_weights_and_groups(mini):
     np.testing.assert_allclose([weights[n] * 3.6 for n in ("leg_l_y", "head_y", "head_z")], [0.3, 1.0, 2.0])
     np.testing.assert_allclose(mini.link_weights, [0.75, 0.25])
     np.testing.assert_array_equal(character.normalised([0.0, 0.0]), [0.0, 0.0])
-    assert [character.joint_group(n) for n in ("hip_l_y", "spine0_y")] == ["hip", "spine0"]
+    names = ("hip_l_y", "spine0_y", "left_hip_y", "right_knee", "R_Elbow_y", "leftover_x")
+    assert [character.joint_group(n) for n in names] == ["hip", "spine0", "hip", "knee", "elbow", "leftover"]
     assert [character.numberless(n) for n in ("hip_l_y", "spine0_y", "tail12")] == ["hip_l_y", "spine_y", "tail"]
     assert [mini.hinges[h] for h in mini.driven] == ["leg_l_y", "leg_r_y", "head_y", "head_z"]  # in the motors' order
     np.testing.assert_allclose(mini.limits, [20, 20, 2, 2])
@@ -713,7 +714,8 @@ def test_readme_table(chars):
 
 def fourth(folder):
     """The character that characters/README.md works out, written as it stands there."""
-    blocks = re.findall(r"```(toml|xml)\n(.*?)```", readme(), re.S)
+    section = re.search(r"^### A fourth one.*?(?=^### )", readme(), re.M | re.S)[0]
+    blocks = re.findall(r"```(toml|xml)\n(.*?)```", section, re.S)
     text = {kind: content for kind, content in blocks}
     assert sorted(kind for kind, _ in blocks) == ["toml", "xml"]
     for kind, content in text.items():

@@ -89,7 +89,7 @@ def test_two_bone_arm():
 
 def test_recordings(tmp_path, capsys):
     """A folder of recordings: one that is none is named and left out; none at all is an error."""
-    with pytest.raises(UserError, match="no recordings; valid: a folder of .csv files"):
+    with pytest.raises(UserError, match="no recordings; valid: a folder of .csv or .bsor files"):
         body.players(tmp_path)
     (tmp_path / "broken.csv").write_text("time,head_px\n0,1\n")
     with pytest.raises(UserError, match="no recordings"):

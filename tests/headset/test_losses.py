@@ -66,3 +66,19 @@ def test_seconds(devices, seconds):
             np.testing.assert_allclose(pos[settled], samples[settled].pos, atol=0.02)
     for i, name in enumerate(("head", "left", "right")):
         assert (guard.events[name, "not finite"] > 0) == (i in SETS[devices])
+
+
+def test_back_as_soon_as_it_was_gone():
+    """Who walks is where they are soon after single frames are lost, not 0.3 s later; and times that stand still."""
+    samples = standing(6.0)
+    walked = [s._replace(pos=s.pos + [1.4 * s.t, 0, 0]) for s in samples]
+    rng = np.random.default_rng(3)
+    mask = single(len(walked), 0.3, rng)
+    mask[:90] = False
+    out, _ = guarded(lose(walked, mask, "head"))
+    errors = np.array([np.linalg.norm(a.pos[0] - b.pos[0]) for a, b in zip(out, walked, strict=True)])
+    settled = ~np.any([np.roll(mask, k) for k in range(6)], axis=0)
+    assert settled[90:].any() and errors[settled].max() < 1e-6 and errors.max() < 0.15 and errors.mean() < 0.02
+    gone = lose([walked[100], walked[101], walked[101]], np.array([False, True, False]), "head")
+    same, _ = guarded(gone)
+    assert all(np.isfinite(s.pos).all() for s in same)

@@ -173,7 +173,7 @@ def test_columns(tmp_path):
     with pytest.raises(UserError, match="no such file; valid"):
         list(lines_of(tmp_path / "none.csv"))
     (tmp_path / "d.csv").mkdir()
-    with pytest.raises(UserError, match="d.csv: is a folder; valid: a .csv file, a named pipe, or -"):
+    with pytest.raises(UserError, match="d.csv: is a folder; valid: a .csv or .bsor file, a named pipe, or -"):
         list(lines_of(tmp_path / "d.csv"))
     assert "head, left, right" in valid_columns()
 
@@ -219,7 +219,7 @@ def test_pipes(tmp_path, monkeypatch):
     reader = Reader("live", strict=False)
     assert len(list(reader.read(lines_of(pipe)))) == len(lines) - 1 and reader.unreadable == 1
     writer.join(10)
-    with pytest.raises(UserError, match="/dev/zero: is a device; valid: a .csv file"):
+    with pytest.raises(UserError, match="/dev/zero: is a device; valid: a .csv or .bsor file"):
         is_live("/dev/zero")
 
     def denied(path, *_):

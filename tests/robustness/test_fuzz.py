@@ -15,7 +15,6 @@ No other exception, no warning, no hang, no memory beyond a multiple of the file
 """
 
 import contextlib
-import copy
 import io
 import json
 import os
@@ -34,10 +33,23 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from damage import (
+    CLAIMS,
+    bsor_damage,
+    claiming,
+    damaged,
+    inserting,
+    json_damage,
+    npy,
+    npz_bytes,
+    npz_damage,
+    zipped,
+)
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from test_amc import cmu_file
 from test_amc import standing as cmu_standing
+from test_bsor import framed, rows_of, written
 from test_mocap import walk, write_as
 from test_retarget import MINI_TOML
 from test_rigs import write_rig
@@ -49,8 +61,9 @@ import retarget
 from env import Env
 from headset import calibration
 from headset.axes import choose
+from headset.bsor import opened
 from headset.player import Player
-from headset.reader import AXES, Reader, lines_of
+from headset.reader import AXES
 from human import sensors
 from mocap import inspect, rigs
 from mocap.data import load
@@ -64,7 +77,7 @@ resource = pytest.importorskip("resource", reason="this system cannot limit a pr
 EXAMPLES, SEED = os.environ.get("FUZZ_EXAMPLES"), int(os.environ.get("FUZZ_SEED", 0))
 SHARES = dict(  # of the inputs
     test_bvh=15, test_asf_and_amc=15, test_joint_maps=8, test_character_tables=13, test_character_models=13,
-    test_policies=14, test_run_folders=13, test_headset_files=5, test_standard_input=4,
+    test_policies=14, test_run_folders=13, test_headset_files=5, test_standard_input=4, test_replays=10,
 )  # fmt: skip
 DEADLINE = 10.0  # s of processor time for one input
 ROOM, TIMES = 32 * 2**20, 400  # bytes of memory: for any input, and for each byte of its files
@@ -202,102 +215,6 @@ def fuzz(tmp_path, capsys, request, monkeypatch):
     return run
 
 
-# ---------------------------------------------------------------- damage
-
-NUMBERS = [
-    b"nan", b"inf", b"-inf", b"1e308", b"-1e308", b"1e999", b"1e-308", b"0", b"-1", b"0.5", b"1000000", b"9" * 5000,
-    b"1000000000000", b"-1000000000000", b"99999999999999999999999", b"1_000", b"1,5", b"0x1F", b"--3", b"+",
-    "\u0661".encode(), b"", b"1e9", b"-180", b"true",
-]  # fmt: skip
-PIECES = [
-    b"", b"{", b"}", b"[", b"]", b'"', b"'", b"=", b"#", b",", b":", b"\\", b"\n", b"\r", b"\t", b"\0", b"\xff", b"<",
-    b">", b"&#0;", b"\x1b[2J", b"\xef\xbb\xbf", b"end", b"root", b"z" * 3000, "\u2028".encode(), b"\xe9", b"[" * 2000,
-    b"{" * 500, b"a." * 400 + b"a=1\n", b'{"a":' * 2000,
-]  # fmt: skip
-NUMBER, WORD = rb"(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?(?![\w.])", rb"[A-Za-z_]\w*"
-
-
-def cut(draw, raw):
-    return raw[: draw(st.integers(0, len(raw)))]
-
-
-def splice(draw, raw):
-    at = draw(st.integers(0, len(raw)))
-    return raw[:at] + draw(st.sampled_from(PIECES) | st.binary(max_size=8)) + raw[at + draw(st.integers(0, 40)) :]
-
-
-def exchange(draw, raw, pattern, others):
-    """One of what matches, replaced."""
-    found = list(re.finditer(pattern, raw))
-    if not found:
-        return raw
-    one = found[draw(st.integers(0, len(found) - 1))]
-    return raw[: one.start()] + draw(st.sampled_from(others)) + raw[one.end() :]
-
-
-def number(draw, raw):
-    return exchange(draw, raw, NUMBER, NUMBERS)
-
-
-def rename(draw, raw):
-    """A word becomes another of the file's: joints, keys and columns of another name, and there twice."""
-    return exchange(draw, raw, WORD, sorted(set(re.findall(WORD, raw))) or [b"a"])
-
-
-def lines(draw, raw):
-    """Lines gone, doubled, moved, repeated very often."""
-    rows = raw.split(b"\n")
-    a, b = (draw(st.integers(0, len(rows) - 1)) for _ in range(2))
-    small = len(raw) < 2**18  # what was repeated 500 times is not repeated so again: memory
-    what = draw(st.sampled_from(["gone", "span", "swap", "double", *(["often", "long"] if small else [])]))
-    if what == "gone":
-        del rows[a]
-    elif what == "span":
-        del rows[min(a, b) : max(a, b)]
-    elif what == "swap":
-        rows[a], rows[b] = rows[b], rows[a]
-    elif what == "double":
-        rows.insert(b, rows[a])
-    elif what == "often":
-        rows[a:a] = [rows[b]] * 500
-    else:
-        rows[a] = rows[a] * 500
-    return b"\n".join(rows)
-
-
-def encoding(draw, raw):
-    codes = ("utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-8-sig", "utf-7", "cp500")
-    how = draw(st.sampled_from([*codes, "crlf", "cr", "upper", "no end", "spaces"]))
-    if how in codes:
-        return raw.decode("latin-1").encode(how)
-    return {"crlf": raw.replace(b"\n", b"\r\n"), "cr": raw.replace(b"\n", b"\r"), "upper": raw.upper(),
-            "no end": raw.rstrip(), "spaces": raw.replace(b" ", b"\t \t")}[how]  # fmt: skip
-
-
-MOVES = (cut, splice, splice, number, number, number, rename, rename, lines, lines, encoding)
-
-
-@st.composite
-def damaged(draw, raw, *more):
-    """Damage to a text, mostly once, else two or three times; now and then any bytes at all."""
-    if not draw(st.integers(0, 29)):
-        return draw(st.binary(max_size=300))
-    for _ in range(draw(st.sampled_from((1, 1, 1, 2, 3)))):
-        raw = draw(st.sampled_from([*MOVES, *more]))(draw, raw)
-    return raw
-
-
-def inserting(text):
-    """A move that puts a text between two lines."""
-
-    def insert(draw, raw):
-        rows = raw.split(b"\n")
-        at = draw(st.integers(0, len(rows)))
-        return b"\n".join([*rows[:at], text, *rows[at:]])
-
-    return insert
-
-
 # ---------------------------------------------------------------- motion
 
 
@@ -400,135 +317,6 @@ MINI = {"mini.xml": b"""<mujoco>
 
 # ---------------------------------------------------------------- policies and runs
 
-VALUES = [
-    None, True, -1, 0, 0.5, 1e308, 10**30, 10**59, "", "0", "nan", "a" * 500, [], [[]], {}, {"a": 1}, [1, "b"], [0],
-    [-3], [10**6, 10**6], [1e9], ["8"], "builtin", float("nan"), float("inf"),
-]  # fmt: skip
-
-
-@st.composite
-def json_damage(draw, tree):
-    """One to three values of a tree replaced, gone or nested without end; as text, which is sometimes damaged again."""
-    tree = json.loads(json.dumps(tree))
-    for _ in range(draw(st.integers(0, 3))):
-        at = tree
-        while True:
-            keys = list(at) if isinstance(at, dict) else list(range(len(at)))
-            key = keys[draw(st.integers(0, len(keys) - 1))]
-            if not (isinstance(at[key], dict | list) and at[key] and draw(st.booleans())):
-                break
-            at = at[key]
-        what = draw(st.sampled_from(["value", "value", "value", "gone", "deep"]))
-        if what == "gone" and len(at) > 1:
-            del at[key]
-        else:
-            at[key] = copy.deepcopy(draw(st.sampled_from(VALUES))) if what == "value" else "DEEP"
-    raw = json.dumps(tree).replace('"DEEP"', "[" * 3000 + "]" * 3000).encode()
-    return draw(damaged(raw)) if draw(st.integers(0, 3)) == 0 else raw
-
-
-def members(raw):
-    """An .npz -> {name: bytes of its .npy}."""
-    with zipfile.ZipFile(io.BytesIO(raw)) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
-
-
-def zipped(entries, compressed=()):
-    """(name, bytes) -> an .npz."""
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w") as archive, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that a name is there twice
-        for k, (name, data) in enumerate(entries):
-            archive.writestr(name, data, zipfile.ZIP_DEFLATED if k in compressed else zipfile.ZIP_STORED)
-    return out.getvalue()
-
-
-def npy(array, pickled=False):
-    out = io.BytesIO()
-    np.lib.format.write_array(out, np.asarray(array), allow_pickle=pickled)
-    return out.getvalue()
-
-
-def claiming(descr, shape, order=False, data=b""):
-    """A .npy whose header says anything."""
-    text = f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}".encode()
-    text += b" " * (-(len(text) + 11) % 64) + b"\n"
-    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + data
-
-
-CLAIMS = [
-    ("'<f4'", "(1000000000000,)"), ("'<f8'", "(1000000,)"), ("'<f8'", "(-1,)"), ("'<f8'", "(0,)"), ("'<f8'", "(1.5,)"),
-    ("'<f8'", f"({2**63},)"), ("'<f8'", f"({2**32}, {2**32}, {2**32})"), ("'<f8'", "5"), ("'<f8'", "(True,)"),
-    ("'|O'", "(1,)"), ("'<U1000000000'", "(1,)"), ("'|V8'", "(1,)"), ("'V0'", "(1000000000000,)"), ("'<U0'", "(7,)"),
-    ("'<M8[s]'", "()"), ("[('a', '<f8')]", "(1,)"), ("'<f8'", "(" * 90 + ")" * 90), ("'what'", "()"), ("None", "()"),
-    ("'<c16'", "()"), ("'>f8'", "()"), ("__import__('os')", "()"), ("'<f8'", "(" + "1," * 40 + ")"),
-    ("'<f8'", "(1L,)"), ("'<f8", "()"), ("'<f8'", "(1,"),
-]  # fmt: skip
-ELEMENTS = [np.nan, np.inf, -np.inf, 1e308, -1.0, 0.0, 1e30, 1e-308]
-
-
-class Code:
-    """Unpickled, it writes a file."""
-
-    def __reduce__(self):
-        return exec, ("open('unpickled', 'w')",)
-
-
-@st.composite
-def npz_damage(draw, raw):
-    """An array's header, numbers, kind or name; a member gone, doubled, compressed or pickled; meta's JSON; bytes."""
-    if draw(st.integers(0, 3)) == 0:
-        for _ in range(draw(st.integers(1, 3))):
-            raw = draw(st.sampled_from([cut, splice, encoding]))(draw, raw)
-        return raw
-    entries, compressed = list(members(raw).items()), ()
-    k = draw(st.integers(0, len(entries) - 1))
-    name, data = entries[k]
-    array = np.lib.format.read_array(io.BytesIO(data))
-    what = draw(st.sampled_from(["meta"] * 4 + ["element"] * 3 + ["claim"] * 2
-                                + "dtype shape gone double rename deflate bomb pickle bytes".split()))  # fmt: skip
-    if what == "meta":
-        k, (name, data) = next((k, e) for k, e in enumerate(entries) if e[0] == "__meta__.npy")
-        meta = json.loads(np.lib.format.read_array(io.BytesIO(data)).tobytes())
-        entries[k] = name, npy(np.frombuffer(draw(json_damage(meta)), np.uint8))
-    elif what == "element" and array.size:
-        array = array.astype(array.dtype if array.dtype.kind == "f" else float)
-        with np.errstate(over="ignore"):
-            array.reshape(-1)[draw(st.integers(0, array.size - 1))] = draw(st.sampled_from(ELEMENTS))
-        entries[k] = name, npy(array)
-    elif what == "claim":
-        entries[k] = name, claiming(*draw(st.sampled_from(CLAIMS)), draw(st.booleans()), data[128:])
-    elif what == "dtype":
-        kind = draw(st.sampled_from(["f8", "f2", "c16", "i1", "u8", "?", "U8", "S4", ">f4", "M8[s]", "V4"]))
-        with np.errstate(all="ignore"):
-            entries[k] = name, npy(np.zeros(array.shape, kind))
-    elif what == "shape":
-        shapes = [array[..., None], array.reshape(-1)[:-1], np.zeros((0, 7)), np.zeros(()), np.repeat(array, 2)]
-        entries[k] = name, npy(draw(st.sampled_from(shapes)))
-    elif what == "gone":
-        del entries[k]
-    elif what == "double":
-        entries.append(entries[k])
-    elif what == "rename":
-        entries[k] = draw(st.sampled_from(["a", "../x.npy", "policy.pi.npy", "a" * 5000, "\u2028.npy"])), data
-    elif what == "deflate":
-        compressed = (k,)
-    elif what == "bomb":
-        entries.append(("bomb.npy", npy(np.zeros(2**23, np.uint8))))
-        compressed = (len(entries) - 1,)
-    elif what == "pickle":
-        entries[k] = name, npy(np.array([Code()], object), True)
-    else:
-        entries[k] = name, draw(damaged(data))
-    return zipped(entries, compressed)
-
-
-def npz_bytes(arrays, meta):
-    out = zipped([(f"{name}.npy", npy(value)) for name, value in arrays.items()])
-    text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
-    return zipped([*members(out).items(), ("__meta__.npy", npy(text))])
-
-
 def check_policy(policy):
     finite([policy.theta_pi, policy.critic.theta, policy.norm.mean, policy.norm.inv_std, float(policy.value_scale)])
     finite(policy.mean_action(np.zeros((2, policy.obs_size))))
@@ -591,22 +379,29 @@ def csv_files():
     return {axes: re.sub(r"(\.\d{4})\d+", r"\1", "".join(to_csv(t, pos, quat, axes))).encode() for axes in AXES}
 
 
-def playing(char, live):
+@pytest.fixture(scope="module")
+def bsor_files():
+    """The same as a replay: with notes and a pause; of an old mod, with names that are longer than they say."""
+    rows = framed(rows_of(1.3, 20.0))
+    names = {"player_name": "Zoë", "song": "夜に駆ける", "mapper": "é"}
+    return [written(rows, pauses=[(1.1, 1)]), written(rows, names, units=True)]
+
+
+def playing(char, live, file="take.csv"):
     """What `play.py --stream` does, with a policy that does nothing."""
     player = Player(char, lambda obs: np.zeros((1, len(char.limits))))
 
     def read(folder):
-        name = "-" if live else folder / "take.csv"
+        name = "-" if live else folder / file
         if not live:
             choice = choose(name)
             finite([v for v in choice[1:3] if v is not None])
             choose(name, "openxr", unit=0.01)
         source = calibration.Stream(char, (folder / "axes").read_text())
-        reader = Reader("standard input" if live else str(name), strict=not live)
         with pytest.MonkeyPatch.context() as patch:
             if live:
-                patch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO((folder / "take.csv").read_bytes())))
-            ticks = (tick for sample in reader.read(lines_of(name)) for tick in source.push(sample))
+                patch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO((folder / file).read_bytes())))
+            ticks = (tick for sample in opened(name, strict=not live)[1] for tick in source.push(sample))
             for k, tick in enumerate(ticks):
                 finite(list(tick))
                 np.testing.assert_allclose(np.linalg.norm(tick.quat, axis=-1), 1.0, atol=1e-6)
@@ -623,7 +418,7 @@ def playing(char, live):
 
 
 @pytest.fixture(scope="module")
-def readers(jesse, bvh_files, cmu_files, policy_file, trainer, run_files, csv_files):
+def readers(jesse, bvh_files, cmu_files, policy_file, trainer, run_files, csv_files, bsor_files):
     """name -> valid folders, as {file: bytes}; the function that reads one; the strategies of damage to its files"""
     text = lambda *names: {name: damaged for name in names}  # noqa: E731
     deep_bvh = lambda raw: damaged(raw, inserting(chain(50)))  # noqa: E731
@@ -642,6 +437,8 @@ def readers(jesse, bvh_files, cmu_files, policy_file, trainer, run_files, csv_fi
         "policy": ([{"p.npz": policy_file}], read_policy, {"p.npz": npz_damage}),
         "run": ([run_files], resuming(trainer), resumed | {"checkpoint.npz": npz_damage}),
         "stream": (list(take.values()), playing(jesse, live=False), text("take.csv")),
+        "replay": ([{"take.bsor": raw, "axes": b"unity"} for raw in bsor_files],
+                   playing(jesse, live=False, file="take.bsor"), {"take.bsor": bsor_damage}),
         "stdin": ([take["unity"]], playing(jesse, live=True), text("take.csv")),
     }  # fmt: skip
 
@@ -677,6 +474,10 @@ def test_run_folders(fuzz, readers):
 
 def test_headset_files(fuzz, readers):
     fuzz(*readers["stream"])
+
+
+def test_replays(fuzz, readers):
+    fuzz(*readers["replay"])
 
 
 def test_standard_input(fuzz, readers):
@@ -782,6 +583,15 @@ HURTING = {  # name: (reader, file, function of the valid file's bytes, whether 
     "200,000 columns": ("run", "metrics.csv", lambda raw: b"a," * 200_000 + b"b\n", False),
     "a stream of drop-outs": ("stream", "take.csv", drop_outs, True),
     "a stream of nanoseconds": ("stream", "take.csv", nanoseconds, False),
+    "a replay of 2^31 frames": (
+        "replay", "take.bsor", lambda raw: raw.replace(struct.pack("<i", 26), struct.pack("<i", 2**31 - 1)), False,
+    ),
+    "a replay of names without end": (
+        "replay", "take.bsor", lambda raw: raw[:6] + b"\xff\0\0\0" + "é".encode() * 9999, False,
+    ),
+    "a replay of pauses": (
+        "replay", "take.bsor", lambda raw: written(framed(rows_of(1.3)), pauses=[(1.2, 2)] * 2000), True,
+    ),
     "a stream in one line": ("stream", "take.csv", lambda raw: raw.replace(b"\n", b",") * 100, False),
 }  # fmt: skip
 
@@ -798,7 +608,8 @@ def test_what_is_meant_to_hurt(readers, tmp_path, case):
 
 
 FILES = ("bvh take.bvh", "amc 16.asf", "amc 16_01.amc", "map map.toml", "toml mini.toml", "xml mini.xml",
-         "policy p.npz", "run config.json", "run metrics.csv", "run checkpoint.npz", "stream take.csv")  # fmt: skip
+         "policy p.npz", "run config.json", "run metrics.csv", "run checkpoint.npz", "stream take.csv",
+         "replay take.bsor")  # fmt: skip
 
 
 @pytest.mark.parametrize("what", ["folder", "empty", "gone", "zeros"])

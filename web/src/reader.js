@@ -348,7 +348,8 @@ export class Guard { // reader.Guard: three devices that may be lost at any time
       if (track.last !== null && (track.lost || step)) {
         if (step) this.count('head', 'step');
         [track.held, track.mix] = [track.last, 0];
-        track.pace = 1 / Math.max(BLEND, distance(own[0], track.held[0]) / CATCH_UP);
+        const fade = step ? BLEND : Math.min(BLEND, Math.max(t - track.since, 1e-6));
+        track.pace = 1 / Math.max(fade, distance(own[0], track.held[0]) / CATCH_UP);
       }
       [track.lost, track.good] = [null, truth[0]];
       track.mix = Math.min(1, track.mix + dt * track.pace);

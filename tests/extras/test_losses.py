@@ -1,0 +1,76 @@
+"""extras/losses.py: the table of falls under lost devices, on little."""
+
+import json
+
+import numpy as np
+import pytest
+from test_stream import standing, to_csv
+
+import character
+from extras import losses
+from headset.reader import Reader
+from plumbing.cli import UserError, run_main
+
+
+def test_rows():
+    """Nothing first; frames and seconds of one device and of all; nothing is lost while it calibrates."""
+    kinds, rng = losses.rows(), np.random.default_rng(0)
+    assert len({k.name for k in kinds}) == len(kinds) == 22 and kinds[0] == losses.Loss()
+    t = 100.0 + np.arange(3000) / 30
+    for kind in kinds:
+        lost = kind.mask(t, rng)
+        want = kind.seconds / losses.EVERY or kind.share
+        assert not lost[:60].any() and abs(lost[60:].mean() - want) < 0.04, kind
+        if kind.seconds:
+            edges = np.flatnonzero(np.diff(lost[150:-150].astype(int), prepend=0, append=0))
+            long = np.diff(edges)[::2] / 30
+            assert np.median(long) == pytest.approx(kind.seconds, abs=0.04) and max(long) < 2 * kind.seconds + 0.1
+
+
+def takes(seconds=4.0):
+    t, pos, quat = zip(*standing(seconds, 30.0))
+    samples = list(Reader("f").read(to_csv(t, pos, quat, "unity")))
+    return losses.Capture("a", samples, {"axes": "unity"})
+
+
+def test_the_same_for_all():
+    """A capture's losses do not depend on the character, nor on when they are drawn; a scale is all that differs."""
+    jesse, dino = (character.load(n) for n in ("jesse", "dino"))
+    (a, height), (again, _), (b, _) = (losses.streams_of(c, takes(), 0) for c in (jesse, jesse, dino))
+    other, _ = losses.streams_of(jesse, takes(), 1)
+    ratio = losses.user_scale(dino, height) / losses.user_scale(jesse, height)
+    for (pos, quat), same, scaled in zip(a, again, b, strict=True):
+        np.testing.assert_array_equal(pos, same[0])
+        np.testing.assert_allclose(pos * ratio, scaled[0], atol=1e-9)
+        np.testing.assert_allclose(quat, scaled[1], atol=1e-12)
+    names = [k.name for k in losses.rows()]
+    assert np.abs(a[names.index("2 s of 5, all")][0] - a[0][0]).max() > 0.01  # something was lost
+    assert any(np.abs(x[0] - y[0]).max() > 0 for x, y in zip(a[1:], other[1:], strict=True))
+    np.testing.assert_array_equal(a[0][0], other[0][0])
+    with pytest.raises(UserError, match="a: .* rows show the headset for"):
+        losses.streams_of(jesse, takes(0.5), 0)
+
+
+def test_table(tmp_path, capsys):
+    """The command on one walk and one recording of a few seconds: every row, the same numbers twice, as JSON too."""
+    t, pos, quat = zip(*standing(4.0, 30.0))
+    (tmp_path / "takes").mkdir()
+    (tmp_path / "takes" / "a.csv").write_text("".join(to_csv(t, pos, quat, "unity")))
+    flags = ["--characters", "jesse", "--most", "1", "--seconds", "3", "--stream", str(tmp_path / "takes")]
+    flags += ["--threads", "1", "--json", str(tmp_path / "o.json")]
+    assert losses.main(flags) == 0
+    out, found = capsys.readouterr().out, json.loads((tmp_path / "o.json").read_text())
+    assert set(found) == {"builtin", "takes"} and out.count("| 1 s of 5, both hands |") == 2
+    for rows in found.values():
+        assert list(rows) == [k.name for k in losses.rows()]
+        for row in rows.values():
+            one = row["Jesse" if "Jesse" in row else "jesse"]
+            assert one["captures"] == 1 and one["completed"] == float(not one["failures"])
+            assert (one["fails_every_s"] is None) == (not one["failures"])
+    assert found["builtin"]["nothing"]["jesse"]["completed"] == 1.0
+    assert losses.main(flags) == 0
+    assert capsys.readouterr().out == out
+    (tmp_path / "none").mkdir()
+    with pytest.raises(SystemExit):
+        run_main(losses.main, [*flags[:6], "--stream", str(tmp_path / "none")])
+    assert "a folder without recordings" in capsys.readouterr().err
