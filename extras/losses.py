@@ -67,7 +67,7 @@ class Options(MotionFlags):
 class Loss:
     """What is lost: a share of single frames, or so many seconds of every EVERY; of devices, a name of `losses.SETS`.
 
-    Test      tests/extras/test_losses.py::test_rows"""
+    Test      tests/extras/test_loss_table.py::test_rows"""
 
     name: str = "nothing"
     devices: str = "all"
@@ -84,7 +84,7 @@ class Loss:
 
 
 def rows() -> list[Loss]:
-    """The table's rows.  Test: tests/extras/test_losses.py::test_rows"""
+    """The table's rows.  Test: tests/extras/test_loss_table.py::test_rows"""
     single = [Loss(f"frames, {p:.0%}, {w}", d, share=p) for w, d in ONE_OR_ALL.items() for p in losses.SHARES]
     long = [Loss(f"{s:g} s of {EVERY:g}, {w}", d, seconds=s) for w, d in ANY.items() for s in LENGTHS]
     return [Loss(), *single, *long]
@@ -113,7 +113,7 @@ def captures(opt: Options) -> dict[str, list[Capture]]:
     """The sets: clips of the validation part with their lead-in, and recordings.
 
     Raises    UserError: nothing there
-    Test      tests/extras/test_losses.py::test_table"""
+    Test      tests/extras/test_loss_table.py::test_table"""
     clips = load(opt.motion, clips=opt.clips, split="validation", reading=Reading.of(opt))
     out = {opt.motion: []}
     for clip in sorted(clips, key=lambda c: c.name)[: opt.most]:
@@ -142,7 +142,7 @@ def streams_of(char, capture: Capture, seed: int):
     """A capture with every row's losses -> (pos (T, 3, 3), quat (T, 3, 4)) each, and the user's headset height [m].
 
     Raises    UserError: it shows no headset for a second
-    Test      tests/extras/test_losses.py::test_the_same_for_all"""
+    Test      tests/extras/test_loss_table.py::test_the_same_for_all"""
     out, height = [], None
     for loss in rows():
         rng = np.random.default_rng([seed, zlib.crc32(f"{capture.name} {loss.name}".encode())])
@@ -176,7 +176,7 @@ def cast_of(opt: Options) -> dict:
 def measured(opt: Options) -> dict:
     """set -> loss -> character -> completed (a share), failures, fails_every_s (None: never).
 
-    Test      tests/extras/test_losses.py::test_table"""
+    Test      tests/extras/test_loss_table.py::test_table"""
     cast, found, kinds = cast_of(opt), {}, rows()
     first = next(iter(cast.values()))[0]
     for title, takes in captures(opt).items():
@@ -194,7 +194,7 @@ def measured(opt: Options) -> dict:
 
 
 def summary(rides) -> dict:
-    """Of one loss, over all captures.  Test: tests/extras/test_losses.py::test_table"""
+    """Of one loss, over all captures.  Test: tests/extras/test_loss_table.py::test_table"""
     failures, seconds = sum(r.failures for r in rides), sum(len(r.qpos) for r in rides) / CONTROL_RATE
     return {
         "captures": len(rides),
@@ -207,7 +207,7 @@ def summary(rides) -> dict:
 def table(found: dict) -> str:
     """A set's table: a line a loss, and for every character completed and fails every.
 
-    Test      tests/extras/test_losses.py::test_table"""
+    Test      tests/extras/test_loss_table.py::test_table"""
     names = list(next(iter(found.values())))
     lines = [["lost", *(f"{n.capitalize()}: {what}" for n in names for what in ("completed", "fails every s"))]]
     for loss, row in found.items():
@@ -218,7 +218,7 @@ def table(found: dict) -> str:
 
 
 def main(argv=None) -> int:
-    """Print the tables.  Test: tests/extras/test_losses.py::test_table"""
+    """Print the tables.  Test: tests/extras/test_loss_table.py::test_table"""
     opt = cli(Options, argv, "python -m extras.losses", __doc__)
     check_folders(opt.json, read=[opt.stream])
     found = measured(opt)
