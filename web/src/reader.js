@@ -1,6 +1,6 @@
 // A headset's rows: columns, axes, and what can go wrong.  Twin of headset/reader.py, name by name.
 
-import { distance, heading, quatAbout, quatConj, quatMul, quatRotate, quatSlerp, subtract, add } from './human.js';
+import { cross, distance, heading, quatAbout, quatConj, quatMul, quatRotate, quatSlerp, subtract, add } from './human.js';
 
 export class UserError extends Error {} // plumbing.cli.UserError: one line for the person at the page
 
@@ -15,14 +15,68 @@ const SEPARATORS = { ';': 'semicolons', '\t': 'tabs', '|': 'bars', ' ': 'spaces'
 
 // ---------------------------------------------------------------------------------- reading
 
+const HEAD = ['head', 'hmd', 'headset', 'centereyeanchor', 'centereye', 'maincamera'];
+const SIDES = ['left', 'right'];
+const HELD = ['hand', 'controller', 'touch', 'wand', 'index', 'anchor', 'device', 'tracker'];
+const POSITION = ['p', 'pos', 'position', 'loc', 'location', 'translation'];
+const ROTATION = ['q', 'quat', 'quaternion', 'rot', 'rotation', 'ori', 'orient', 'orientation'];
+const MATRIX = ['m', 'mat', 'matrix', 'pose', 'transform'];
+const AXIS = ['x', 'y', 'z', 'w'];
+const WORDS = [...HEAD, ...SIDES, ...HELD, ...POSITION, ...ROTATION, ...AXIS].sort((a, b) => b.length - a.length);
+const TIME = /^(?:delta|elapsed|session|system)?(?:time|timestamp|t)(s|sec|seconds|ms|us|ns|milliseconds)?$/;
+const SECONDS = { ms: 1e-3, milliseconds: 1e-3, us: 1e-6, ns: 1e-9 };
+const lettersOf = (text) => text.toLowerCase().replace(/[^a-z]/g, '');
+
 export function column(name) { // reader.column: the canonical name of a column, or null
-  name = name.trim().replace(/^"+|"+$/g, '').toLowerCase();
-  if (['time', 't', 'timestamp'].includes(name)) return 'time';
-  const device = '(head|hmd|headset|(?:left|right)(?:_hand|_controller)?)';
-  const found = name.match(new RegExp(`^${device}_(?:(?:p|pos_|position_|)([xyz])|(?:q|rot_|rotation_)([xyzw]))$`));
-  if (!found) return null;
-  const which = ['head', 'hmd', 'headset'].includes(found[1]) ? 'head' : found[1].split('_')[0];
-  return found[2] ? `${which}_p${found[2]}` : `${which}_q${found[3]}`;
+  if (TIME.test(lettersOf(name))) return 'time';
+  const text = name.trim().replace(/^"+|"+$/g, '').replace(/[[(](?:c|m)?m[\])]|[_ ](?:c|m)?m$/g, ''); // a length's unit
+  const letters = lettersOf(text);
+  const digits = text.match(/\d/g);
+  if (digits) return matrixColumn(letters, digits);
+  const words = wordsOf(letters);
+  const device = deviceOf(words);
+  const axis = words.filter((w) => AXIS.includes(w));
+  const [turns, moves] = [ROTATION, POSITION].map((kind) => words.some((w) => kind.includes(w)));
+  if (!device || axis.length !== 1 || (turns && moves) || (axis[0] === 'w' && !turns)) return null;
+  return `${device}_${turns ? 'q' : 'p'}${axis[0]}`;
+}
+
+function wordsOf(letters) { // reader._words: the words that make up the letters, or none
+  const found = letters.length < 80 ? letters.match(new RegExp(WORDS.join('|'), 'g')) ?? [] : [];
+  return found.join('') === letters ? found : [];
+}
+
+function deviceOf(words) { // reader._device
+  const devices = new Set(words.filter((w) => SIDES.includes(w)));
+  if (words.some((w) => HEAD.includes(w))) devices.add('head');
+  return devices.size === 1 ? [...devices][0] : null;
+}
+
+function matrixColumn(letters, digits) { // reader._matrix_column: "hmd_m03" -> head_m03
+  const found = letters.match(new RegExp(`^(${[...HEAD, ...SIDES].join('|')})(?:${HELD.join('|')})*(?:${MATRIX.join('|')})*$`));
+  if (!found || digits.length !== 2 || digits[0] > 2 || digits[1] > 3) return null;
+  return `${deviceOf([found[1]])}_m${digits.join('')}`;
+}
+
+export const timeUnit = (name) => SECONDS[lettersOf(name).match(TIME)?.[1]] ?? 1; // reader.time_unit [s]
+
+export function poseOf(m) { // reader.pose_of: 3 x 4 numbers of a matrix -> position, quaternion x, y, z, w
+  const [a, b, c] = [0, 4, 8].map((i) => m.slice(i, i + 3));
+  const dot = (u, v) => u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
+  const near = (x, y) => Math.abs(x - y) <= 0.05 + 1e-5 * Math.abs(y); // as numpy.allclose
+  const turned = [[a, a], [b, b], [c, c]].every(([u, v]) => near(dot(u, v), 1))
+    && [[a, b], [a, c], [b, c]].every(([u, v]) => near(dot(u, v), 0)) && dot(a, cross(b, c)) >= 0;
+  if (!m.every(Number.isFinite) || !turned) return Array(7).fill(NaN);
+  const trace = a[0] + b[1] + c[2];
+  const four = [ // each a multiple of the quaternion w, x, y, z: the longest is the exactest
+    [1 + trace, c[1] - b[2], a[2] - c[0], b[0] - a[1]],
+    [c[1] - b[2], 1 + 2 * a[0] - trace, a[1] + b[0], a[2] + c[0]],
+    [a[2] - c[0], a[1] + b[0], 1 + 2 * b[1] - trace, b[2] + c[1]],
+    [b[0] - a[1], a[2] + c[0], b[2] + c[1], 1 + 2 * c[2] - trace],
+  ];
+  const q = four.reduce((p, r) => (Math.hypot(...r) > Math.hypot(...p) ? r : p));
+  const [w, x, y, z] = q.map((v) => v / Math.hypot(...q));
+  return [m[3], m[7], m[11], x, y, z, w];
 }
 
 export function parseNumber(word) { // plumbing.files.parse_number: what Python's float() reads; NaN-or-throw
@@ -34,7 +88,8 @@ export function parseNumber(word) { // plumbing.files.parse_number: what Python'
 }
 
 export const validColumns = () => // reader.valid_columns
-  'time (optional) and DEVICE_px, _py, _pz, _qx, _qy, _qz, _qw for DEVICE head, left, right';
+  'time (optional) and DEVICE_px, _py, _pz, _qx, _qy, _qz, _qw for DEVICE head, left, right, '
+  + "or a matrix's DEVICE_m00 to _m23";
 
 export function* linesOf(text) { // reader.lines_of: lines with their ends
   for (let start = 0; start < text.length;) {
@@ -49,6 +104,7 @@ export class Reader { // reader.Reader, of files: a line that cannot be read is 
   constructor(name, devices = 3) {
     Object.assign(this, { name, steps: [], before: null, line: 0, unreadable: 0, at: null, names: null });
     this.wanted = COLUMNS.slice(0, 1 + devices * PARTS.length);
+    [this.matrices, this.second] = [[], 1];
     this.axes = null; // ours: what a comment before the columns says, as the page's own recordings do
   }
 
@@ -85,7 +141,7 @@ export class Reader { // reader.Reader, of files: a line that cannot be read is 
         continue;
       }
       const device = (d) => values.slice(1 + 7 * d, 8 + 7 * d);
-      if (this.steps.length < JUDGED && !fault(device(0))) this.judge(values[0]);
+      if (this.steps.length < JUDGED && !fault(device(0), Infinity)) this.judge(values[0]);
       const rows = [0, 1, 2].map(device);
       yield { t: values[0], pos: rows.map((r) => r.slice(0, 3)), quat: rows.map((r) => r.slice(3)) };
     }
@@ -123,8 +179,13 @@ export class Reader { // reader.Reader, of files: a line that cannot be read is 
       const valid = 'commas, and points in the numbers';
       this.fail(`, line ${this.line}: ${SEPARATORS[mark]} between the columns; valid: ${valid}`);
     }
-    const missing = this.wanted.slice(1).filter((c) => !known.includes(c));
-    const twice = known.find((c, i) => c && known.indexOf(c) !== i);
+    const used = DEVICES.slice(0, Math.floor(this.wanted.length / PARTS.length));
+    const entries = used.map((d) => [0, 1, 2].flatMap((i) => [0, 1, 2, 3].map((j) => `${d}_m${i}${j}`)));
+    this.matrices = entries.map((names, k) => [k, names.map((c) => known.indexOf(c))])
+      .filter(([, at]) => at.every((i) => i >= 0));
+    const told = new Set(this.matrices.flatMap(([k]) => PARTS.map((p) => `${DEVICES[k]}_${p}`)));
+    const missing = this.wanted.slice(1).filter((c) => !known.includes(c) && !told.has(c));
+    const twice = known.find((c, i) => c && c !== 'time' && known.indexOf(c) !== i);
     if (twice) this.fail(`, line ${this.line}: column ${twice} is there twice; valid: once each`);
     if (missing.length) {
       const more = missing.length > 4 ? ` and ${missing.length - 4} more` : '';
@@ -134,6 +195,7 @@ export class Reader { // reader.Reader, of files: a line that cannot be read is 
         + `valid: ${validColumns()}${alone}`);
     }
     this.at = this.wanted.map((c) => known.indexOf(c));
+    this.second = this.at[0] >= 0 ? timeUnit(this.names[this.at[0]]) : 1;
   }
 
   values(line) { // reader.Reader.values: the numbers of a row in the order of COLUMNS
@@ -145,16 +207,22 @@ export class Reader { // reader.Reader, of files: a line that cannot be read is 
       throw new UserError(`column ${name}: ${cells.length} cells; valid: ${valid}`);
     }
     const out = Array(COLUMNS.length).fill(NaN);
-    this.at.forEach((i, k) => {
-      const cell = i >= 0 ? cells[i].trim().replace(/^"+|"+$/g, '') : '';
-      if (EMPTY.includes(cell.toLowerCase())) return;
-      try {
-        out[k] = parseNumber(cell);
-      } catch {
-        throw new UserError(`column ${this.names[i]}: '${cell.slice(0, 40)}'; valid: a number, or nothing`);
-      }
+    this.at.forEach((i, k) => { out[k] = this.number(cells, i); });
+    out[0] *= this.second;
+    this.matrices.forEach(([k, at]) => {
+      poseOf(at.map((i) => this.number(cells, i))).forEach((x, j) => { out[1 + 7 * k + j] = x; });
     });
     return out;
+  }
+
+  number(cells, i) { // reader.Reader.number: NaN for a column that is not there, or an empty cell
+    const cell = i >= 0 ? cells[i].trim().replace(/^"+|"+$/g, '') : '';
+    if (EMPTY.includes(cell.toLowerCase())) return NaN;
+    try {
+      return parseNumber(cell);
+    } catch {
+      throw new UserError(`column ${this.names[i]}: '${cell.slice(0, 40)}'; valid: a number, or nothing`);
+    }
   }
 }
 
@@ -164,9 +232,12 @@ export const AXES = { // reader.AXES: rows are our x, y, z in the source's coord
   unity: [[0, 0, 1], [-1, 0, 0], [0, 1, 0]],
   openxr: [[0, 0, -1], [-1, 0, 0], [0, 1, 0]], // WebXR's, too
   mujoco: [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+  openvr: [[0, 0, -1], [-1, 0, 0], [0, 1, 0]],
+  unreal: [[1, 0, 0], [0, -1, 0], [0, 0, 1]],
 };
-const MIRRORED = { unity: -1, openxr: 1, mujoco: 1 }; // the matrices' determinants
-export const GRIP = { unity: 15, openxr: 90, mujoco: 90 }; // reader.GRIP [degrees]
+const MIRRORED = { unity: -1, openxr: 1, mujoco: 1, openvr: 1, unreal: -1 }; // the matrices' determinants
+const UNIT = { unreal: 0.01 }; // reader.UNIT: metres a unit, where it is not 1
+export const GRIP = { unity: 15, openxr: 90, mujoco: 90, openvr: 15, unreal: 15 }; // reader.GRIP [degrees]
 
 export function toWorld(pos, quat, axes, grip = null) { // reader.to_world
   const m = AXES[axes];
@@ -174,7 +245,7 @@ export function toWorld(pos, quat, axes, grip = null) { // reader.to_world
   const degrees = -90 + (grip ?? GRIP[axes]);
   const turn = quatAbout(1, (degrees * Math.PI) / 180);
   return {
-    pos: pos.map(apply),
+    pos: pos.map((v) => apply(v).map((x) => x * (UNIT[axes] ?? 1))),
     quat: quat.map((q, i) => {
       const own = [q[3], ...apply(q).map((x) => MIRRORED[axes] * x)];
       return i && degrees ? quatMul(own, turn) : own;
@@ -233,10 +304,10 @@ export class Clock { // reader.Clock: the time column -> seconds since the first
   }
 }
 
-export function fault(row) { // reader.fault: why a device's row cannot be a pose, or null
+export function fault(row, far = FAR_AWAY) { // reader.fault: why a device's row cannot be a pose, or null
   if (!row.every(Number.isFinite)) return 'not finite';
   if (row.every((x) => x === 0)) return 'all zero';
-  if (Math.max(...row.slice(0, 3).map(Math.abs)) > FAR_AWAY) return 'far away';
+  if (Math.max(...row.slice(0, 3).map(Math.abs)) > far) return 'far away';
   const norm = Math.hypot(...row.slice(3).map((x) => Math.min(Math.max(x, -1e3), 1e3)));
   return Math.abs(norm - 1) > 0.1 ? 'no rotation' : null;
 }

@@ -5,6 +5,7 @@ import { mkdtempSync, readFileSync, rmSync, writeFileSync } from 'node:fs';
 import { tmpdir } from 'node:os';
 import { join } from 'node:path';
 import { test } from 'node:test';
+import { quatMatrix } from '../src/human.js';
 import { COLUMNS, Reader, linesOf } from '../src/reader.js';
 import { Stream } from '../src/calibration.js';
 import { expected, web } from './tools.js';
@@ -20,6 +21,16 @@ const blank = (r, device, value = '') => { r.fill(value, 1 + 7 * device, 8 + 7 *
 
 const OTHER = COLUMNS.map((c) => c.replace('head_p', 'hmd_pos_').replace('_q', '_rot_'));
 
+const WORDS = COLUMNS.map((c) => c.replace(/^(left|right)_p/, '$1 Hand.Position.').replace(/^(left|right)_q/, '$1Controller-Rotation ')
+  .replace('head_p', 'HMD pos ').replace('head_q', 'Head_Orientation_').toUpperCase());
+const MATRICES = ['t', ...['hmd', 'left', 'right'].flatMap((d) => [0, 1, 2].flatMap((i) => [0, 1, 2, 3].map((j) => `${d}_m${i}${j}`)))];
+const asMatrices = (r) => [r[0], ...[0, 1, 2].flatMap((d) => {
+  const [px, py, pz, ...q] = r.slice(1 + 7 * d, 8 + 7 * d);
+  const [x, y, z, w] = q.map((v) => v / Math.hypot(...q)); // the file has rounded ones
+  const m = quatMatrix([w, x, y, z]);
+  return [...m.slice(0, 3), px, ...m.slice(3, 6), py, ...m.slice(6, 9), pz];
+})];
+
 const GOOD = {
   plain: csv(copy()),
   'controller lost for two seconds': csv(between(copy(), 3, 5, (r) => blank(r, 1))),
@@ -34,6 +45,9 @@ const GOOD = {
   'another clock': csv(copy().map((r, i) => { if (i > 300) r[0] += 1000; return r; })),
   'no times': csv(copy().map((r) => r.slice(1)), COLUMNS.slice(1)),
   'other names, BOM, CRLF': `\ufeff${csv(copy(), OTHER)}`.replaceAll('\n', '\r\n'),
+  'names in words': csv(copy(), WORDS),
+  'poses as matrices': csv(copy().map(asMatrices), MATRICES),
+  'milliseconds by name': csv(copy().map((r) => [r[0] * 1000, ...r.slice(1)]), ['delta_time_ms', ...COLUMNS.slice(1)]),
   'last line cut short': `${csv(copy())}10.0,0.1,0.`,
   'floor elsewhere': csv(copy().map((r) => { for (const k of [2, 9, 16]) r[k] += 3; return r; })),
 };
