@@ -664,7 +664,7 @@ def test_check_command(tmp_path, thin_xml, capsys):
     out = capsys.readouterr().out
     assert out.startswith("oppy: 20.0 kg") and "40 hinges, 31 driven, 46 degrees of freedom" in out
     rows = {line.split()[0]: line for line in out.splitlines()[2:]}
-    assert rows["shoulder_l_x"].split()[1:3] == ["13.34", "6.00"] and rows["shoulder_l_x"].endswith("upper_arm_l")
+    assert rows["shoulder_l_x"].split()[1:3] == ["13.34", "2.50"] and rows["shoulder_l_x"].endswith("upper_arm_l")
     assert rows["ear_l_y"].endswith("nobody: passive") and "shoulder_r_x" not in rows and "head 5.00" in out
     (tmp_path / "bare.xml").write_text(thin_xml.replace('<freejoint name="root"/>', ""))
     assert check.main([str(tmp_path / "bare.xml")]) == 1

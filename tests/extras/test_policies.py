@@ -77,8 +77,12 @@ def test_blended(tmp_path):
     other = Path(ppo.__file__).parent / "characters" / "jesse-hmd.npz"
     assert load_policy(other)[1]["licence"] != "MIT"
     assert policies.ship(other, tmp_path / "again.npz")["licence"] == load_policy(other)[1]["licence"]
-    with pytest.raises(UserError, match="blend .*: networks .*; valid: policies of one ancestor"):
+    with pytest.raises(UserError, match="jesse-hmd.npz: another body or pose"):  # its shoulders' springs are stiffer
         policies.ship(paths[1], tmp_path / "c.npz", [other])
+    weights, own = load_checkpoint(other, ("policy.*",))
+    save_checkpoint(tmp_path / "small.npz", weights, own | {"options": own["options"] | {"set": None}})
+    with pytest.raises(UserError, match="blend .*: networks .*; valid: policies of one ancestor"):
+        policies.ship(paths[1], tmp_path / "c.npz", [tmp_path / "small.npz"])
     arrays, meta = load_checkpoint(paths[0] / CHECKPOINT, ("policy.*",))
     save_checkpoint(tmp_path / "bent.npz", arrays, meta | {"options": meta["options"] | {"set": "pose.spine_y=0.2"}})
     with pytest.raises(UserError, match="bent.npz: another body or pose"):
