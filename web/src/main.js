@@ -76,8 +76,9 @@ const heard = {
     character = m;
     app.ready = true;
     view.build(m.shapes);
-    const harm = /noncommercial/i.test(m.licence) ? ' Not for commercial use.' : '';
-    $('licence').textContent = `${capital(m.name)}'s policy: ${m.licence}.${harm}`;
+    const harm = /noncommercial/i.test(m.licence) ? 'not for commercial use' : 'free to use';
+    $('terms').textContent = `${capital(m.name)}'s policy: ${harm}; whose motion it learnt from is in the small print.`;
+    $('licence').textContent = `${capital(m.name)}'s policy: ${m.licence}.`;
     refreshWords();
   },
   state(m) {
