@@ -33,7 +33,7 @@ import metrics
 import mocap.data
 import retarget
 from character import Character
-from env import EPISODE_STEPS, Env
+from env import EPISODE_STEPS, ROOT_LIMIT, Env
 from headset import axes, calibration
 from headset.bsor import opened
 from headset.player import Pace, Player, drive, ride, stream_of
@@ -539,6 +539,13 @@ def check_options(opt: Options, argv) -> None:
     check_folders(opt.json, opt.png, opt.video, opt.bvh, read=(*mocap.data.parts(opt.motion), opt.stream, opt.policy))
 
 
+def told_life(name, recording) -> str:
+    """A line: how long it lived, and what ends a tracked play.  Test: tests/test_play.py::test_told_life"""
+    lived, whole = (n / CONTROL_RATE for n in (len(recording.frames) - 1, recording.available))
+    why = f": it fell, or was {ROOT_LIMIT:g} m from the user's root (§3.6)" if recording.failed else ""
+    return f"{name}: lived {lived:.1f} s of {whole:.1f}{why}"
+
+
 def main(argv=None):
     """python play.py: measure, picture, film or show a policy.  Test: tests/test_play.py::test_measure_json"""
     argv = metrics.listed(argv, "--compare")
@@ -609,7 +616,7 @@ def look(char: Character, policy, path, meta, opt: Options) -> None:
         recording = simulate(char, seen, policy_action(policy), threads=opt.threads, push=push)[0]
         lived = (len(recording.frames) - 1) / CONTROL_RATE
         print(
-            f"{ref.names[0]}: lived {lived:.1f} s of {recording.available / CONTROL_RATE:.1f}"
+            told_life(ref.names[0], recording)
             + (f"; pushed by {push.newtons:g} N at {push.at:g} s" if push and push.at < lived else "")
         )
         if opt.bvh:

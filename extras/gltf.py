@@ -323,8 +323,7 @@ def recorded(char: Character, policy, path, meta, opt: Options):
     check_fits(policy, Env(char, seen, 1), path)
     recording = simulate(char, seen, policy_action(policy), threads=opt.threads)[0]
     last = round(opt.seconds * CONTROL_RATE) if opt.seconds else EPISODE_STEPS
-    lived = (len(recording.frames) - 1) / CONTROL_RATE
-    print(f"{ref.names[0]}: lived {lived:.1f} s of {recording.available / CONTROL_RATE:.1f}")
+    print(play.told_life(ref.names[0], recording))
     return recording.qpos[: last + 1]
 
 

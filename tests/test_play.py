@@ -434,3 +434,13 @@ def test_comparison_sheet(two, tmp_path, monkeypatch):
     monkeypatch.setattr(retarget, "draw", blank), monkeypatch.setattr(play, "pictures", blank)
     coarse = play.comparison_sheet(arms, clips[0], play.Options(threads=1, every=0.5, seconds=1.0), size=(96, 80))
     assert coarse.shape[1] == 3 * 96
+
+
+def test_told_life():
+    """How long, and of one that failed why a tracked play ends."""
+    shape = dict(qpos=None, contact=None, action=None)
+    whole = metrics.Recording(np.arange(31), failed=False, available=30, **shape)
+    assert play.told_life("walk", whole) == "walk: lived 1.0 s of 1.0"
+    short = metrics.Recording(np.arange(16), failed=True, available=30, **shape)
+    said = "walk: lived 0.5 s of 1.0: it fell, or was 0.3 m from the user's root (§3.6)"
+    assert play.told_life("walk", short) == said
