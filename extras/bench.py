@@ -28,6 +28,8 @@ import resource
 import time
 from dataclasses import dataclass, replace
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as ppo.py does, and says why; before NumPy is loaded
+
 import mujoco
 import numpy as np
 from mujoco import rollout
@@ -47,8 +49,6 @@ from plumbing.runs import rng_from_state, rng_state, versions
 from policy import load_policy
 from skeletal.layers import SLOPE, fk_backward, fk_forward
 from skeletal.net import Generator, rec_loss
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as ppo.py does, and says why; before NumPy is loaded
 
 
 @dataclass
