@@ -246,7 +246,8 @@ def pace(info) -> float:
     Test      tests/headset/test_bsor.py::test_times"""
     if np.isfinite(info["speed"]) and 0.1 <= info["speed"] <= 10.0:
         return info["speed"]
-    return next((PACES[m] for m in info["modifiers"].split(",") if m.strip() in PACES), 1.0)
+    said = (m.strip() for m in info["modifiers"].split(","))
+    return next((PACES[m] for m in said if m in PACES), 1.0)
 
 
 def played(times, pace: float, pauses) -> np.ndarray:

@@ -107,7 +107,8 @@ def test_times(tmp_path):
     t = [s.t for s in Replay(saved(tmp_path, written(rows, pauses=[(2.0, 7), (1.0, 2)]))).samples()]
     want = np.arange(270) / 90
     np.testing.assert_allclose(t, want + 2 * (want > 1.0) + 7 * (want > 2.0), atol=1e-5)
-    for info, speed in (({"modifiers": "GN,FS"}, 1.2), ({"modifiers": "SS"}, 0.85), ({"speed": 0.8}, 0.8), ({}, 1.0)):
+    fast, spaced, slow = {"modifiers": "GN,FS"}, {"modifiers": "GN, FS"}, {"modifiers": "SS"}
+    for info, speed in ((fast, 1.2), (spaced, 1.2), (slow, 0.85), ({"speed": 0.8}, 0.8), ({}, 1.0)):
         replay = Replay(saved(tmp_path, written(rows, info)))
         assert bsor.pace(replay.info) == pytest.approx(speed)
         assert list(replay.samples())[90].t == pytest.approx(1.0 / speed, rel=1e-5)
