@@ -299,8 +299,7 @@ class Trainer:
         opt, policy, batch, epochs = self.opt, self.policy, self.samples(), []
         batch.old_std = policy.log_std.copy()
         for epoch in range(opt.epochs):
-            order = self.rng.permutation(len(batch.adv))
-            parts = [order[k : k + opt.minibatch] for k in range(0, len(order), opt.minibatch)]
+            parts = self.minibatches(len(batch.adv))
             critic = aside(partial(self.fit_critic, batch, parts), self.two)
             if epoch == 0:  # for the next samples; these are normalised already
                 policy.norm.update(self.raw)
@@ -310,6 +309,11 @@ class Trainer:
                 break
         self.adam_pi.follow_kl(kl, opt.target_kl)
         return self.told({k: fmean(e[k] for e in epochs) for k in epochs[0]} | {"kl": kl}, batch.explained)
+
+    def minibatches(self, samples) -> list:
+        """The numbers of so many samples in a random order, cut into minibatches: of one epoch."""
+        order, size = self.rng.permutation(samples), self.opt.minibatch
+        return [order[k : k + size] for k in range(0, samples, size)]
 
     def fit_policy(self, batch, parts) -> dict:
         """One epoch of the actor.  -> means over its minibatches"""

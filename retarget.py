@@ -473,6 +473,13 @@ def artefacts(char: Character, clip: Clip, pose: Pose) -> dict:
 OWN = "own"  # names of the character's own bodies, and its own frames
 
 
+def to_file(v):
+    """Our axes -> those of BVH and glTF: x forward, y left, z up -> x left, y up, z forward.  (..., 3) -> (..., 3)
+
+    Test      tests/test_retarget_bvh.py::test_bvh_round_trip, tests/extras/test_gltf.py::test_second_reader"""
+    return np.roll(v, -1, axis=-1)
+
+
 def write_bvh(path, char: Character, qpos, rate, names=OWN) -> None:
     r"""A character's motion as BVH: a joint for each of its bodies.
 
@@ -490,7 +497,6 @@ def write_bvh(path, char: Character, qpos, rate, names=OWN) -> None:
     m, fk = char.model, forward_kinematics(char, qpos)
     bodies = [b for b in range(1, m.nbody) if m.body_rootid[b] == char.root]
     parents = np.array([bodies.index(m.body_parentid[b]) if b != char.root else -1 for b in bodies])
-    to_file = lambda v: np.roll(v, -1, axis=-1)  # noqa: E731  (x, y, z) -> (y, z, x): left, up, forward
     own = names == OWN
     rest = np.tile([1.0, 0, 0, 0], (m.nbody, 1)) if own else humanoid.t_pose(char)
     called = [m.body(b).name or f"body{b}" for b in range(m.nbody)] if own else humanoid.names(char, names)

@@ -28,7 +28,7 @@ from mocap.data import CONTROL_RATE, MotionFlags
 from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cli, run_main
 from plumbing.files import atomic_write, check_folders
 from policy import check_fits, devices_of, find_policy, load_character
-from retarget import forward_kinematics
+from retarget import forward_kinematics, to_file
 
 SLICES, STACKS = 20, 5  # of a round shape: sides, and rings from pole to equator
 ROUGHNESS = 0.8  # skin and cloth shine little
@@ -187,11 +187,6 @@ class Blob:
         self.views.append(view)
         self.accessors.append(accessor)
         return len(self.accessors) - 1
-
-
-def to_file(v):
-    """x forward, y left, z up -> x left, y up, z forward.  (..., 3) -> (..., 3)"""
-    return np.roll(v, -1, axis=-1)
 
 
 def xyzw(q):

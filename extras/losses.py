@@ -34,9 +34,10 @@ from headset.axes import choose
 from headset.bsor import opened
 from headset.calibration import HIPS, Stream
 from headset.player import Player, recorded, ride
-from headset.reader import SAMPLE_RATE, Sample, files_of
+from headset.reader import SAMPLE_RATE, Sample
 from mocap.data import CONTROL_RATE, MotionFlags, load
 from mocap.rigs import Reading
+from play import recordings_of
 from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cell, cli, markdown, run_main
 from plumbing.files import atomic_write, check_folders
 from retarget import sensor_scale
@@ -120,9 +121,7 @@ def captures(opt: Options) -> dict[str, list[Capture]]:
         samples, _ = recorded(clip)
         out[opt.motion].append(Capture(clip.name, samples, {"axes": "mujoco", "rate": clip.rate}).cut(opt.seconds))
     if opt.stream:
-        files = files_of(opt.stream)[: opt.most]
-        if not files:
-            raise UserError(f"--stream {opt.stream}: a folder without recordings; valid: one of .csv or .bsor files")
+        files = recordings_of(opt.stream)[: opt.most]
         out[Path(opt.stream).name or opt.stream] = [recording(file, opt.seconds) for file in files]
     return out
 

@@ -133,8 +133,7 @@ class Student(ppo.Trainer):
         opt, batch, epochs = self.opt, self.samples(), []
         wanted = self.wanted.reshape(batch.mu.shape)
         for _ in range(opt.epochs):
-            order = self.rng.permutation(len(batch.adv))
-            parts = [order[k : k + opt.minibatch] for k in range(0, len(order), opt.minibatch)]
+            parts = self.minibatches(len(batch.adv))
             losses = [self.copy(batch.x[rows], wanted[rows]) for rows in parts]
             epochs.append({"policy_loss": fmean(losses), "value_loss": self.fit_critic(batch, parts)})
         found = {k: fmean(e[k] for e in epochs) for k in epochs[0]}
