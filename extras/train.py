@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import sys
 import time
 from dataclasses import dataclass, fields, replace
@@ -60,6 +61,7 @@ class Options(ppo.Options):
     retry: float = arg(0.0, "share of episodes that start up to 2 s before a place where one failed", check=UNIT)
     stand: float = arg(0.0, "share that start in the default pose under the headset, as a stream does", check=UNIT)
     begin: float = arg(0.0, "share that start so under a user who stands still before a visit", check=UNIT)
+    even: float = arg(0.0, "share of the starts that is shared out evenly among --motion's parts", check=UNIT)
     players: str | None = arg(
         None, "also the people of a headset's recordings (a folder of .csv files), with bodies (headset/body.py)"
     )
@@ -85,18 +87,24 @@ class Curriculum(Uniform):
               by frames × rate of failure:  p(sequence) ∝ frames (1 + h / ⟨h⟩) / E[T],  E[T] = (1 − e^{−hH}) / h, within
               the sequence uniform.  A share `retry` starts RETRY steps before a place where an episode failed of late.
               A share `begin` starts in the still frames before a visit, in sequences drawn by 1 + min(h / ⟨h⟩, MOST)
-              with `balance`, evenly without.  Those stand in the default pose, and a share `stand` of all
+              with `balance`, evenly without.  Those stand in the default pose, and a share `stand` of all.
+              A share `even` of either kind is shared out evenly among the sets that sequences come from (`evened`)
     Symbols   h failures a step, of late (`count`); ⟨h⟩ its mean over frames; H horizon; T steps of an episode
     Why       after a while most failures are in a few sequences, and a uniform draw spends its steps on the others;
               within them they are at a few places, such as the first steps of a run.  And a policy that has always been
-              put into mid-motion has never set off
+              put into mid-motion has never set off.  What has few recordings is not what users do seldom: sixty
+              gestures and steps backwards beside nine hundred walks and runs were one start in thirty, and not learnt
     Note      with `balance` a failure of a start in the default pose counts as one of the sequence that it was in
-    Test      tests/extras/test_train.py::test_balanced_starts, test_retried_starts, test_begun_starts
+    Test      tests/extras/test_train.py::test_balanced_starts, test_retried_starts, test_begun_starts, test_even_starts
     """
 
-    def __init__(self, ref: Reference, horizon=EPISODE_STEPS, balance=False, retry=0.0, stand=0.0, begin=0.0):
+    def __init__(
+        self, ref: Reference, horizon=EPISODE_STEPS, balance=False, retry=0.0, stand=0.0, begin=0.0, even=0.0, sets=None
+    ):
+        """sets : (S,) which set each sequence comes from, 0, 1, …  (`set_of`); all from one by default"""
         super().__init__(ref)
         self.horizon, self.balance, self.retry, self.stand, self.begin = horizon, balance, retry, stand, begin
+        self.even, self.sets = even, np.zeros(len(ref.first), int) if sets is None else np.asarray(sets)
         self.failed = np.full(len(ref.first), 0.5)  # of each sequence, failures and steps lived, of late
         self.lived = np.full(len(ref.first), float(horizon))
         self.lost = np.zeros(PLACES, int)  # frames at which episodes failed of late; 0: none yet
@@ -106,7 +114,7 @@ class Curriculum(Uniform):
 
     def draw(self, rng, n):
         """As `Uniform.draw`: frames (n,), and which start in the default pose (n,) bool."""
-        f = self.balanced(rng, n) if self.balance else rng.choice(self.frames, n)
+        f = self.balanced(rng, n) if self.balance or self.even else rng.choice(self.frames, n)
         if self.retry:
             place = self.lost[rng.integers(PLACES, size=n)]
             before = place - rng.integers(*RETRY, size=n)
@@ -124,9 +132,11 @@ class Curriculum(Uniform):
         """Frames (n,): sequences by how often they are wanted, frames within them evenly."""
         ref = self.ref
         frames = np.maximum(ref.last - ref.first - 1, 0)  # that can be started from
-        h = np.maximum(self.failed / self.lived, 1e-6)
-        p = frames * (1.0 + h / np.average(h, weights=frames)) * h / -np.expm1(-h * self.horizon)
-        cdf = np.cumsum(p)
+        p = frames.astype(float)
+        if self.balance:
+            h = np.maximum(self.failed / self.lived, 1e-6)
+            p *= (1.0 + h / np.average(h, weights=frames)) * h / -np.expm1(-h * self.horizon)
+        cdf = np.cumsum(evened(p, self.sets, self.even))
         k = np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right")
         return ref.first[k] + 1 + (frames[k] * rng.random(n)).astype(int)
 
@@ -134,7 +144,8 @@ class Curriculum(Uniform):
         """Frames (n,) among the still ones at the beginning of the sequences that have some."""
         ref, k = self.ref, self.leads
         h = np.maximum(self.failed[k] / self.lived[k], 1e-6)
-        cdf = np.cumsum(1.0 + np.minimum(h / h.mean(), MOST) if self.balance else np.ones(len(k)))
+        p = 1.0 + np.minimum(h / h.mean(), MOST) if self.balance else np.ones(len(k))
+        cdf = np.cumsum(evened(p, self.sets[k], self.even))
         k = k[np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right").clip(0, len(k) - 1)]
         return ref.first[k] + 1 + (rng.random(n) * (ref.still[k] - 1)).astype(int)
 
@@ -164,6 +175,18 @@ class Curriculum(Uniform):
             raise ValueError("env.starts.failed or lived is negative")
         for name, value in arrays.items():
             getattr(self, name)[:] = value
+
+
+def evened(p, sets, share):
+    r"""Weights of which a share is spread evenly over sets.
+
+    Equation  p' = (1 − share) p / Σ p + share p / (K Σ_{own set} p),  K the sets that have any weight
+    Args      p : (S,) weights ≥ 0; sets : (S,) int; share in [0, 1]
+    Returns   (S,), whose sum is 1
+    Test      tests/extras/test_train.py::test_even_starts"""
+    total = np.bincount(sets, p)
+    own = np.where(total > 0, total, 1.0)[sets] * np.count_nonzero(total)
+    return (1.0 - share) * p / p.sum() + share * p / own
 
 
 class Disturbance:
@@ -242,6 +265,23 @@ def clips_of(opt: Options) -> list:
         clips = clips + augment.visits(people, np.random.default_rng([opt.seed, 6]))
         clips += [replace(c, still=round(PLAYERS_STAND * c.rate)) for c in people]
     return clips
+
+
+CHANGED = re.compile(r"(\+\d+)?(-mirrored.*)?(-visit)?$")  # what stitching, `augment` and `visits` add to a name
+
+
+def set_of(names, opt: Options) -> np.ndarray:
+    """Which part of --motion, or --players, each sequence comes from; what is built in counts as one.
+
+    Args      names : of sequences, as a Reference has them
+    Returns   (S,) int: 0 what is built in, then 1, 2, … in the order of the folders
+    Test      tests/extras/test_train.py::test_even_starts"""
+    found = {}
+    for i, part in enumerate([*data.parts(opt.motion), *([opt.players] if opt.players else [])], 1):
+        path = Path(part)
+        if part not in data.BUILTIN:
+            found |= {f.stem: i for f in (path.rglob("*") if path.is_dir() else [path])}
+    return np.array([found.get(CHANGED.sub("", name), 0) for name in names])
 
 
 def say(text):
@@ -380,7 +420,7 @@ def make_env(opt: Options) -> Env:
     ref = reference_of(opt, char)
     ref = headset_only(ref) if opt.sensors == "hmd" else ref
     added = {name: getattr(opt, name) for name in ("sensor_offset", "sensor_noise", "push")}
-    starts = {name: getattr(opt, name) for name in ("balance", "retry", "stand", "begin")}
+    starts = {name: getattr(opt, name) for name in ("balance", "retry", "stand", "begin", "even")}
     return Env(
         char,
         ref,
@@ -390,7 +430,7 @@ def make_env(opt: Options) -> Env:
         opt.episode,
         disturbance=Disturbance(opt.envs, ref.sensor_pos.shape[1], **added) if any(added.values()) else None,
         asymmetric="asymmetric" not in opt.without,
-        starts=Curriculum(ref, opt.episode, **starts) if any(starts.values()) else None,
+        starts=Curriculum(ref, opt.episode, **starts, sets=set_of(ref.names, opt)) if any(starts.values()) else None,
         root_limit=patience(ref, opt.root_limit, opt.root_lag) if opt.root_lag else opt.root_limit,
     )
 

@@ -150,6 +150,30 @@ def test_begun_starts(visited):
         Curriculum(walks, begin=0.4)
 
 
+def test_even_starts(char, visited, tmp_path):
+    """A share of the draws is the same for every set, whatever it holds; within a set the weights are as they were."""
+    p, sets = np.array([1.0, 3.0, 4.0, 0.0]), np.array([0, 0, 2, 3])
+    np.testing.assert_allclose(train.evened(p, sets, 0.0), p / 8)
+    np.testing.assert_allclose(train.evened(p, sets, 1.0), [1 / 8, 3 / 8, 4 / 8, 0])
+    np.testing.assert_allclose(train.evened(p, sets, 0.5), (train.evened(p, sets, 0) + train.evened(p, sets, 1)) / 2)
+
+    ref, n, rng, owner = visited, 20_000, np.random.default_rng(0), Uniform(visited).owner
+    frames = (ref.last - ref.first - 1) / np.sum(ref.last - ref.first - 1)
+    own = np.array([0, 1, 1, 1])
+    for begin, balance in ((0.0, False), (0.0, True), (1.0, False), (1.0, True)):
+        starts = Curriculum(ref, begin=begin, balance=balance, even=0.6, sets=own if not begin else 1 - own[::-1])
+        drawn = np.bincount(owner[starts.draw(rng, n)[0]], minlength=4) / n
+        expected = 0.4 * frames + 0.6 * np.array([0.5, *(0.5 * frames[1:] / frames[1:].sum())])
+        np.testing.assert_allclose(drawn, [0, 0, 0.5, 0.5] if begin else expected, atol=0.02)
+
+    (tmp_path / "a/deeper").mkdir(parents=True)
+    for name in ("a/x_1.bvh", "a/deeper/y-2_01.bvh", "p_0.csv"):
+        (tmp_path / name).touch()
+    opt = small(tmp_path / "run", motion=f"standing,{tmp_path / 'a'},builtin", players=str(tmp_path / "p_0.csv"))
+    names = ["walk_3+7", "x_1+2", "x_1", "y-2_01-mirrored-restyled-speed1.1-h0.9a1.0t1.2-visit", "p_0-visit", "y-2"]
+    np.testing.assert_array_equal(train.set_of(names, opt), [0, 2, 2, 2, 4, 0])
+
+
 def test_begun_episodes_stand(char, visited):
     """In the environment: the default pose under the headset, at a still frame."""
     env = Env(char, visited, 200, threads=1, starts=Curriculum(visited, begin=1.0), root_limit=0.6)
@@ -389,11 +413,12 @@ def test_switches_reach_the_environment(tmp_path):
     assert type(plain.starts) is Uniform and plain.disturbance is None and (plain.root_limit == 0.30).all()
     assert motions(plain.ref) == motions(again.ref) == motions(ppo.make_env(opt).ref)
     more = dict(sensor_offset=0.02, sensor_noise=0.01, push=0.3, root_limit=0.5, episode=77, solver="newton")
-    more |= dict(balance=True, stand=0.2, sensors="hmd", without=("contact", "asymmetric"))
+    more |= dict(balance=True, stand=0.2, even=0.3, sensors="hmd", without=("contact", "asymmetric"))
     env = train.make_env(replace(opt, **more))
     d, s = env.disturbance, env.starts
     assert (d.sensor_offset, d.sensor_noise, d.push, d.error.shape) == (0.02, 0.01, 0.3, (5, 3, 3))
-    assert (s.balance, s.retry, s.stand, s.begin, s.horizon) == (True, 0.0, 0.2, 0.0, 77)
+    assert (s.balance, s.retry, s.stand, s.begin, s.even, s.horizon) == (True, 0.0, 0.2, 0.0, 0.3, 77)
+    assert len(s.sets) == len(env.ref.names)
     assert (env.n, env.horizon, env.root_limit[0], env.devices, env.asymmetric) == (5, 77, 0.5, 1, False)
     assert {t for t in TERMS if env.char.reward[t][0] == 0} == {"contact"}
     assert env.char.model.opt.iterations == 100 != plain.char.model.opt.iterations
@@ -406,7 +431,7 @@ def test_switches_reach_the_environment(tmp_path):
 
 def test_resume_is_exact_when_disturbed(tmp_path):
     """The same with everything on that draws random numbers: other users, device errors, pushes."""
-    more = "--augment --balance --retry 0.3 --stand 0.3 --begin 0.3 --sensor-offset 0.02 --sensor-noise 0.005".split()
+    more = "--augment --balance --retry 0.3 --stand 0.3 --begin 0.3 --even 0.3 --sensor-offset 0.02 --sensor-noise 0.005".split()
     more += ["--push", "5"]
     run(tmp_path / "whole", 4, *more)
     run(tmp_path / "a", 2, *more)
