@@ -159,7 +159,8 @@ def toml_of(name) -> Path:
     path = Path(name) if str(name).endswith(".toml") else CHARACTERS / f"{name}.toml"
     if not path.is_file():
         known = ", ".join(available())
-        raise UserError(f"no character {str(name)!r}; there are: {known}; or give the path of a .toml file")
+        what = f"no file {path}" if str(name).endswith(".toml") else f"no character {str(name)!r}"
+        raise UserError(f"{what}; there are: {known}; or give the path of a .toml file")
     return path
 
 

@@ -43,7 +43,7 @@ from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_acti
 from mocap.augment import resize
 from mocap.data import CONTROL_RATE
 from mocap.rigs import Reading
-from plumbing.cli import NONNEGATIVE, POSITIVE, UserError, arg, cli, given_flags, run_main
+from plumbing.cli import NONNEGATIVE, PNG, POSITIVE, UserError, arg, cli, given_flags, run_main
 from plumbing.files import atomic_write, check_folders
 from policy import check_fits
 from retarget import Reference, forward_kinematics
@@ -89,7 +89,7 @@ class Options(retarget.BvhFlags, StreamFlags, metrics.Options):
     every: float | None = arg(
         None, "seconds between the pictures of the contact sheet: 0.5; with --compare eight pictures", check=POSITIVE
     )
-    png: str | None = arg(None, "write a contact sheet")
+    png: str | None = arg(None, "write a contact sheet", check=PNG)
     video: str | None = arg(None, "write a video (.mp4; needs the extra `view`)")
     view: str | None = arg(
         None, "show it live: window (MuJoCo's viewer) or web (in a browser)", choices=("window", "web")

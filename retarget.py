@@ -43,7 +43,7 @@ from mocap import humanoid
 from mocap.bvh import BvhError, write
 from mocap.data import MotionFlags, load
 from mocap.rigs import Reading
-from plumbing.cli import UserError, arg, cli, run_main
+from plumbing.cli import PNG, UserError, arg, cli, run_main
 from plumbing.files import check_folders
 
 STAGE_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -560,7 +560,7 @@ class BvhFlags:
 class Options(MotionFlags, BvhFlags, character.Switches):
     """What `python retarget.py` can be told."""
 
-    png: str | None = arg(None, "write a contact sheet of the first clip, human and character side by side")
+    png: str | None = arg(None, "write a contact sheet of the first clip, human and character", check=PNG)
     camera: str = arg("track", "camera of the pictures: track, side, front, or another of the model's")
     video: str | None = arg(None, "write a video of the first clip (.mp4; needs the extra `view`)")
 

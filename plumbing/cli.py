@@ -64,6 +64,7 @@ POSITIVE = (lambda v: 0 < v < HUGE, "greater than 0 and below 1e18")
 NONNEGATIVE = (lambda v: 0 <= v < HUGE, "0 or greater, and below 1e18")
 UNIT = (lambda v: 0 <= v <= 1, "from 0 to 1")
 COUNT = (lambda v: 1 <= v <= 10**6, "from 1 to 1000000")
+PNG = (lambda v: v.lower().endswith(".png"), "a name that ends in .png")
 THREADS = (lambda v: 0 <= v <= 1024, "from 0 to 1024")
 ALL_POSITIVE = (lambda v: len(v) > 0 and all(x > 0 for x in v), "one or more numbers greater than 0, as in 256,128")
 

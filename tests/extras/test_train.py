@@ -431,8 +431,8 @@ def test_switches_reach_the_environment(tmp_path):
 
 def test_resume_is_exact_when_disturbed(tmp_path):
     """The same with everything on that draws random numbers: other users, device errors, pushes."""
-    more = "--augment --balance --retry 0.3 --stand 0.3 --begin 0.3 --even 0.3 --sensor-offset 0.02 --sensor-noise 0.005".split()
-    more += ["--push", "5"]
+    more = "--augment --balance --retry 0.3 --stand 0.3 --begin 0.3 --sensor-offset 0.02 --sensor-noise 0.005".split()
+    more += ["--push", "5", "--even", "0.3"]
     run(tmp_path / "whole", 4, *more)
     run(tmp_path / "a", 2, *more)
     run(tmp_path / "a", 4, "--resume")

@@ -124,6 +124,9 @@ def test_wrong_character(script, here, capsys):
     more = ["--measure"] if script == "play" else []
     err = refuse(capsys, here, script, "--character", "jessy", *more)
     assert "no character 'jessy'; there are: " in err and "jesse" in err
+    assert f"no file {here / 'absent.toml'}; there are: " in refuse(
+        capsys, here, script, "--character", here / "absent.toml", *more
+    )
     bad = here / "bob.toml"
     for text, words in (
         ("name = [", "bob.toml"),
@@ -204,8 +207,11 @@ def test_folder_to_write(here, capsys):
     ):
         more = ["--measure", "--policy", "none.npz"] if script == "play" else []
         for flag in flags:
-            err = refuse(capsys, here, script, *more, "--motion", "none", flag, here / "no" / "x.bvh")
-            assert f"cannot write {here / 'no' / 'x.bvh'}: there is no folder {here / 'no'}" in err
+            out = here / "no" / ("x.png" if flag == "--png" else "x.bvh")
+            err = refuse(capsys, here, script, *more, "--motion", "none", flag, out)
+            assert f"cannot write {out}: there is no folder {here / 'no'}" in err
+        err = refuse(capsys, here, script, *more, "--motion", "none", "--png", here / "x.tga")
+        assert "x.tga is not valid; it must be a name that ends in .png" in err
 
 
 def test_nothing_read_is_overwritten(here, capsys):
@@ -223,8 +229,8 @@ def test_nothing_read_is_overwritten(here, capsys):
         ("retarget", "--motion", f"builtin,{folder}", "--bvh", own),
         ("retarget", "--motion", own, "--bvh", here / "link.bvh"),
         ("play", "--motion", folder, "--bvh", own, "--policy", policy),
-        ("play", "--png", policy, "--policy", policy),
-        ("play", "--stream", own, "--png", own),
+        ("play", "--video", policy, "--policy", policy),
+        ("play", "--stream", own, "--bvh", own),
     ):
         assert f"cannot write {flags[3] if flags[2] != '--policy' else flags[1]}: it is read from" in refuse(
             capsys, here, script, *flags
