@@ -89,9 +89,11 @@ export function calibrate(table, pos, quat, userHeight = null) { // calibration.
 }
 
 export class Stream { // calibration.Stream
-  constructor(table, { axes = 'unity', sampleRate = SAMPLE_RATE, grip = null, userHeight = null, devices = 3 } = {}) {
+  constructor(table, how = {}) {
+    const { axes = 'unity', grip = null, unit = null, order = [0, 1, 2], sampleRate = SAMPLE_RATE, userHeight = null,
+      devices = 3 } = how;
     if (!AXES[axes]) throw new UserError(`--axes ${axes}: unknown; valid: ${Object.keys(AXES).join(', ')}`);
-    Object.assign(this, { table, axes, grip, userHeight });
+    Object.assign(this, { table, axes, grip, unit, order, userHeight });
     this.clock = new Clock(sampleRate);
     this.guard = new Guard(CONTROL_RATE, devices);
     this.resampler = new Resampler();
@@ -101,7 +103,9 @@ export class Stream { // calibration.Stream
   push(sample) {
     this.rows += 1;
     const t = this.clock.stamp(sample.t);
-    return t === null ? [] : this.#go({ t, ...toWorld(sample.pos, sample.quat, this.axes, this.grip) });
+    if (t === null) return [];
+    const [pos, quat] = [sample.pos, sample.quat].map((of) => this.order.map((i) => of[i]));
+    return this.#go({ t, ...toWorld(pos, quat, this.axes, this.grip, this.unit) });
   }
 
   idle(seconds) { // nothing came for so long: the ticks of a drop-out

@@ -107,7 +107,12 @@ const heard = {
   ended(m) {
     app.end = m;
     if (mode === 'file') say('');
-    if (mode === 'file' && m.report.length) $('note').textContent = `${fileName}: ${m.report.join('; ')}`;
+    const told = [app.note, m.report.length ? `${fileName}: ${m.report.join('; ')}` : ''].filter((line) => line);
+    if (mode === 'file' && told.length) $('note').textContent = told.join(' · ');
+  },
+  note({ text }) { // how a file is read
+    app.note = text;
+    if (text) $('note').textContent = text;
   },
   recording({ name, csv, bvh }) {
     const box = $('downloads');
@@ -157,16 +162,16 @@ async function playFile(file) {
     say(`${file.name}: ${(file.size / 1e6).toFixed(0)} MB; valid: at most ${BIGGEST / 1e6} MB`);
     return;
   }
-  const text = new TextDecoder().decode(await file.arrayBuffer());
+  const bytes = new Uint8Array(await file.arrayBuffer());
   const fields = [['rate', 'rows a second'], ['height', "headset's height"]];
   const wrong = fields.find(([id]) => number(id) !== null && !(number(id) > 0));
   if (wrong) {
     say(`${wrong[1]} ${$(wrong[0]).value}: valid: a number greater than 0`);
     return;
   }
-  [mode, fileName, app.end] = ['file', file.name, null];
+  [mode, fileName, app.end, app.note] = ['file', file.name, null, ''];
   send('play', {
-    text, name: file.name, axes: $('axes').value, grip: number('grip'), sampleRate: number('rate') ?? undefined,
+    bytes, name: file.name, axes: $('axes').value, grip: number('grip'), sampleRate: number('rate') ?? undefined,
     userHeight: number('height'), alone: $('alone').checked,
   });
   refreshWords();

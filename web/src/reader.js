@@ -236,16 +236,16 @@ export const AXES = { // reader.AXES: rows are our x, y, z in the source's coord
   unreal: [[1, 0, 0], [0, -1, 0], [0, 0, 1]],
 };
 const MIRRORED = { unity: -1, openxr: 1, mujoco: 1, openvr: 1, unreal: -1 }; // the matrices' determinants
-const UNIT = { unreal: 0.01 }; // reader.UNIT: metres a unit, where it is not 1
+export const UNIT = { unreal: 0.01 }; // reader.UNIT: metres a unit, where it is not 1
 export const GRIP = { unity: 15, openxr: 90, mujoco: 90, openvr: 15, unreal: 15 }; // reader.GRIP [degrees]
 
-export function toWorld(pos, quat, axes, grip = null) { // reader.to_world
+export function toWorld(pos, quat, axes, grip = null, unit = null) { // reader.to_world
   const m = AXES[axes];
   const apply = (v) => m.map((row) => row[0] * v[0] + row[1] * v[1] + row[2] * v[2]);
   const degrees = -90 + (grip ?? GRIP[axes]);
   const turn = quatAbout(1, (degrees * Math.PI) / 180);
   return {
-    pos: pos.map((v) => apply(v).map((x) => x * (UNIT[axes] ?? 1))),
+    pos: pos.map((v) => apply(v).map((x) => x * (unit ?? UNIT[axes] ?? 1))),
     quat: quat.map((q, i) => {
       const own = [q[3], ...apply(q).map((x) => MIRRORED[axes] * x)];
       return i && degrees ? quatMul(own, turn) : own;

@@ -4,7 +4,9 @@
 //   worker -> page   loaded, state (after each control step), calibrating, ended, recording, error
 
 import { CALIBRATION, CONTROL_RATE, Stream } from './calibration.js';
-import { COLUMNS, GAP, Reader, UserError, linesOf } from './reader.js';
+import { choose } from './axes.js';
+import { Replay, isReplay } from './bsor.js';
+import { COLUMNS, GAP, Reader, UNIT, UserError, linesOf } from './reader.js';
 import { Player } from './player.js';
 import { Simulation, fetchCharacter, visualShapes } from './character.js';
 import { loadMujoco } from './mujoco.js';
@@ -19,7 +21,7 @@ const started = loadMujoco();
 let sim = null;
 let player = null;
 let source = null; // { kind: file or live, stream, … }
-let recording = null; // { samples, frames, axes }
+let recording = null; // { samples, frames, options }
 let [paused, speed] = [false, 1];
 let due = 0; // ms, when the next tick of a file is to be played
 let [lastSample, lastIdle] = [0, 0]; // ms, of a live headset: its last row, and the last time that none came
@@ -63,15 +65,28 @@ function streamOf(options) {
   return new Stream(sim.table, { ...options, devices });
 }
 
-// order : { text, name, axes, grip, sampleRate, userHeight, alone, loop }
+// order : { text, or a file's bytes, name, axes, grip, sampleRate, userHeight, alone, loop }
 function play(order) {
   const devices = order.alone ? 1 : sim.table.policy.devices;
-  const reader = new Reader(order.name, devices);
-  const samples = reader.read(linesOf(order.text));
+  const [reader, samples] = opened(order, devices);
   const first = samples.next(); // the header, and a comment that says which axes
   const options = { ...order, axes: reader.axes || order.axes };
+  if (options.axes === 'auto') {
+    const found = isReplay(order.name) ? { axes: 'unity', lines: [] } : choose(() => opened(order, devices)[1], devices);
+    Object.assign(options, found, { grip: order.grip ?? found.grip });
+    post('note', { text: found.lines.map((line) => `${order.name}: ${line}`).join('; ') });
+  }
   source = { kind: 'file', order, options, reader, stream: streamOf(options), waiting: [], samples, first };
   begin();
+}
+
+function opened({ name, bytes, text }, devices) { // bsor.opened: the reader of a file, and its samples
+  if (isReplay(name)) {
+    const replay = new Replay(name, bytes, devices);
+    return [replay, replay.samples()];
+  }
+  const reader = new Reader(name, devices);
+  return [reader, reader.read(linesOf(text ?? new TextDecoder().decode(bytes)))];
 }
 
 function live() {
@@ -182,9 +197,11 @@ function record(s) {
   if (recording && recording.samples.length < 3 * KEPT) recording.samples.push(s);
 }
 
-function asCsv({ samples, axes }) { // export.as_csv: what headset.reader plays again
+function asCsv({ samples, options }) { // export.as_csv: what headset.reader plays again, devices in order, in the axes' unit
+  const { axes, order = [0, 1, 2], unit } = options;
+  const size = unit ? unit / (UNIT[axes] ?? 1) : 1;
   const cell = (x) => (Number.isFinite(x) ? String(x) : '');
-  const rows = samples.map((s) => [s.t, ...[0, 1, 2].flatMap((i) => [...s.pos[i], ...s.quat[i]])].map(cell).join(','));
+  const rows = samples.map((s) => [s.t, ...order.flatMap((i) => [...s.pos[i].map((x) => x * size), ...s.quat[i]])].map(cell).join(','));
   return [`# recorded by the page; axes: ${axes}`, COLUMNS.join(','), ...rows].join('\n') + '\n';
 }
 
@@ -211,7 +228,7 @@ const handlers = {
   },
   record({ on }) {
     if (on) {
-      recording = { samples: [], frames: [], axes: source?.options?.axes || 'openxr' };
+      recording = { samples: [], frames: [], options: source?.options || { axes: 'openxr' } };
       return;
     }
     if (!recording) return;

@@ -2,6 +2,7 @@
 
 python web/test/expected.py loop CSV       each character: physics under given controls, first tick, 20 s of closed loop
 python web/test/expected.py stream CSV ... each file: the ticks, or the complaint
+python web/test/expected.py axes CSV ...       each file: axes, grip, unit, order and what is said of them
 python web/test/expected.py bvh FILE       names and frames; with NAME QPOS how far it is from Python's
 """
 
@@ -16,6 +17,8 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 import character  # noqa: E402
+from headset.axes import choose  # noqa: E402
+from headset.bsor import Replay, is_replay  # noqa: E402
 from headset.calibration import Stream  # noqa: E402
 from headset.player import Player, drive  # noqa: E402
 from headset.reader import Reader, lines_of  # noqa: E402
@@ -70,18 +73,24 @@ def loop(path):
 
 
 def stream(paths):
-    """The ticks of each file, for Jesse: [[pos, quat] ...], or why there are none."""
+    """The ticks of each file, for Jesse: [[pos, quat] ...], or why there are none; the file is called FILE."""
     char, out = character.load("jesse"), []
     for path in paths:
         try:
-            source, reader = Stream(char, "unity"), Reader("FILE")
-            ticks = [tick for s in reader.read(lines_of(path)) for tick in source.push(s)]
+            source = Stream(char, "unity")
+            samples = Replay(path).samples() if is_replay(path) else Reader("FILE").read(lines_of(path))
+            ticks = [tick for s in samples for tick in source.push(s)]
             if source.calibration is None:
                 raise UserError(f"FILE: {source.uncalibrated()}")
             out.append({"ticks": [np.concatenate([t.pos.ravel(), t.quat.ravel()]).tolist() for t in ticks]})
         except UserError as error:
-            out.append({"error": str(error)})
+            out.append({"error": str(error).replace(path, "FILE")})
     return out
+
+
+def axes(paths):
+    """How each file is read where nobody told its axes."""
+    return [choose(path)._asdict() for path in paths]
 
 
 def bvh(path, name=None, qpos=None):
@@ -102,5 +111,6 @@ def bvh(path, name=None, qpos=None):
 
 if __name__ == "__main__":
     command, *paths = sys.argv[1:]
-    results = {"loop": lambda: loop(paths[0]), "stream": lambda: stream(paths), "bvh": lambda: bvh(*paths)}
+    results = {"loop": lambda: loop(paths[0]), "stream": lambda: stream(paths), "axes": lambda: axes(paths)}
+    results["bvh"] = lambda: bvh(*paths)
     json.dump(results[command](), sys.stdout)

@@ -67,7 +67,7 @@ test('a dropped file: a broken one gives one clear line, a good one plays', asyn
   const message = () => page.evaluate(() => (document.getElementById('message').hidden ? ''
     : document.getElementById('message').textContent));
   const demo = readFileSync(join(web, 'dist/data/demo.csv'), 'utf8').split('\n');
-  const files = { 'picture.csv': '\u0089PNG\r\n\u001a\n\0\0', 'empty.csv': '', 'word.csv': [...demo.slice(0, 50),
+  const files = { 'picture.csv': '\u0089PNG\r\n\u001a\n\0\0', 'empty.csv': '', 'empty.bsor': '', 'word.csv': [...demo.slice(0, 50),
     demo[50].replace(/,[^,]*,/, ',oops,'), ...demo.slice(51, 90), ''].join('\n') };
   for (const [name, text] of Object.entries(files)) {
     await drop(page, name, text);

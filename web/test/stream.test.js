@@ -7,6 +7,7 @@ import { join } from 'node:path';
 import { test } from 'node:test';
 import { quatMatrix } from '../src/human.js';
 import { COLUMNS, Reader, linesOf } from '../src/reader.js';
+import { Replay } from '../src/bsor.js';
 import { Stream } from '../src/calibration.js';
 import { expected, web } from './tools.js';
 
@@ -66,17 +67,69 @@ const BROKEN = {
   'old Mac line ends': csv(copy(5)).replaceAll('\n', '\r'),
 };
 
+// A replay of Beat Saber, written from the format's public description.
+function replay({ rows = copy(300), strings = {}, numbers = {}, notes = [0, 2, 1, 3], pauses = [], sections = 6 } = {}) {
+  const [i4, f4] = [4, 4].map((n, k) => (x) => {
+    const b = Buffer.alloc(n);
+    return k ? (b.writeFloatLE(x), b) : (b.writeInt32LE(x), b);
+  });
+  const text = ([said, length = Buffer.byteLength(said)]) => Buffer.concat([i4(length), Buffer.from(said)]);
+  const names = ['0.5.4', '1.20', '1662541830', '7', 'Alice', 'steam', 'OpenVR', 'Index', 'Knuckles', 'A'.repeat(40), 'Song', 'Me',
+    'Expert'].map((word, k) => text(strings[k] ?? [word]));
+  const { hands = 0, speed = 0 } = numbers;
+  const info = [...names, i4(8123), text(['Standard']), text(['First']), text(strings.modifiers ?? ['']), f4(18.5),
+    Buffer.from([hands]), ...[1.7, 0, 0, speed].map(f4)];
+  const frames = rows.map((r) => Buffer.concat([f4(r[0]), i4(90), ...r.slice(1).map(f4)]));
+  const events = notes.map((kind, k) => Buffer.concat([i4(20113), f4(k), f4(k), i4(kind), Buffer.alloc(kind < 2 ? 72 : 0)]));
+  const stops = pauses.map(([start, long]) => {
+    const b = Buffer.alloc(12);
+    b.writeBigInt64LE(BigInt(long));
+    b.writeFloatLE(start, 8);
+    return b;
+  });
+  const bodies = [info, [i4(frames.length), ...frames], [i4(events.length), ...events], [i4(1), Buffer.alloc(16)],
+    [i4(2), Buffer.alloc(16)], [i4(stops.length), ...stops]];
+  return Buffer.concat([Buffer.from([0x69, 0x3d, 0x2d, 0x44, 1]),
+    ...bodies.slice(0, sections).flatMap((body, k) => [Buffer.from([k]), ...body])]);
+}
+
+const changed = (raw, at, value) => { const out = Buffer.from(raw); out[at] = value; return out; };
+const REPLAYS = {
+  'a replay': replay(),
+  'two pauses, slower by a modifier': replay({ pauses: [[1, 1], [2.5, 3]], strings: { modifiers: ['NF,SS'] } }),
+  practised: replay({ numbers: { speed: 1.5 }, notes: [] }),
+  "a name's length in UTF-16": replay({ strings: { 4: ['Jürgen 猫', 8] } }),
+  'the frames alone': replay({ sections: 2 }),
+};
+const BROKEN_REPLAYS = {
+  'no replay': Buffer.from('time,head_px\n0,1\n'),
+  nothing: Buffer.alloc(0),
+  'another version': changed(replay(), 4, 9),
+  'a count too large': changed(replay({ sections: 2 }), replay({ sections: 1 }).length + 4, 9),
+  'no frames': replay({ rows: [] }),
+  'a number that is none': replay({ rows: between(copy(300), 1, 1.01, (r) => { r[9] = NaN; }) }),
+  'a time that is none': replay({ rows: between(copy(300), 1, 1.01, (r) => { r[0] = Infinity; }) }),
+  'neither hand': replay({ numbers: { hands: 7 } }),
+  'a pause before time': replay({ pauses: [[2, -5]] }),
+  'another section': changed(replay(), replay({ sections: 2 }).length, 5),
+  'cut in a frame': replay().subarray(0, 900),
+  'cut in the notes': replay().subarray(0, replay({ sections: 3 }).length - 9),
+  'cut in the info': replay().subarray(0, 60),
+};
+
 const folder = mkdtempSync(join(tmpdir(), 'streams-'));
 const write = (text, i) => {
-  writeFileSync(join(folder, `${i}.csv`), text);
-  return join(folder, `${i}.csv`);
+  const name = join(folder, `${i}.${typeof text === 'string' ? 'csv' : 'bsor'}`);
+  writeFileSync(name, text);
+  return name;
 };
 
 function ticksOf(text) {
   const stream = new Stream(table);
   const ticks = [];
   try {
-    for (const sample of new Reader('FILE').read(linesOf(text))) ticks.push(...stream.push(sample));
+    const samples = typeof text === 'string' ? new Reader('FILE').read(linesOf(text)) : new Replay('FILE', text).samples();
+    for (const sample of samples) ticks.push(...stream.push(sample));
   } catch (error) {
     return { error: error.message };
   }
@@ -85,9 +138,10 @@ function ticksOf(text) {
 }
 
 test('the same ticks as Python, whatever goes wrong', (t) => {
-  const wanted = expected('stream', ...Object.values(GOOD).map(write));
-  Object.keys(GOOD).forEach((name, i) => {
-    const got = ticksOf(GOOD[name]);
+  const all = { ...GOOD, ...REPLAYS };
+  const wanted = expected('stream', ...Object.values(all).map(write));
+  Object.keys(all).forEach((name, i) => {
+    const got = ticksOf(all[name]);
     assert.equal(got.error, wanted[i].error, name);
     assert.equal(got.ticks.length, wanted[i].ticks.length, name);
     let worst = 0;
@@ -101,9 +155,10 @@ test('the same ticks as Python, whatever goes wrong', (t) => {
 test('one clear line for a broken file, the same as Python', (t) => {
   const words = (text) => text.replace(/--sample-rate/, 'the sample rate')
     .replace(/--sensors hmd needs the headset's alone/, '"headset alone" needs the headset\'s only');
-  const wanted = expected('stream', ...Object.values(BROKEN).map(write));
-  Object.keys(BROKEN).forEach((name, i) => {
-    const got = ticksOf(BROKEN[name]);
+  const all = { ...BROKEN, ...BROKEN_REPLAYS };
+  const wanted = expected('stream', ...Object.values(all).map(write));
+  Object.keys(all).forEach((name, i) => {
+    const got = ticksOf(all[name]);
     assert.equal(got.error, words(wanted[i].error ?? 'none'), name);
     assert.ok(!got.error.includes('\n'));
     t.diagnostic(got.error.slice(0, 110));
