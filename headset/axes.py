@@ -285,6 +285,16 @@ def beginning(path, devices=3, seconds=SECONDS[1]) -> list[Sample]:
     return out
 
 
+def told(path, devices=3) -> str | None:
+    """The axes that a file's own first lines tell, as those of a recording of the page.  None: it tells none of AXES
+
+    Raises    UserError: as `Reader`
+    Test      tests/headset/test_axes.py::test_choose"""
+    reader, samples = opened(path, devices=devices)
+    next(samples, None)
+    return reader.axes if reader.axes in AXES else None
+
+
 def lie(samples) -> bool:
     """Whether both controllers lie somewhere, in nobody's hands.  Test: tests/headset/test_axes.py::test_lying"""
     pos = np.array([s.pos for s in tracked(samples)])
@@ -302,13 +312,14 @@ def choose(path, wanted="auto", grip=None, unit=None, order=(0, 1, 2), devices=3
         raise UserError(f"--axes {wanted}: unknown; valid: auto, {', '.join(AXES)}")
     if is_live(path) or wanted == "auto" and is_replay(path):
         return Choice("unity" if wanted == "auto" else wanted, grip, unit, tuple(order), [])
+    if wanted == "auto" and (own := told(path, devices)):
+        return Choice(own, grip, unit, tuple(order), [f"axes as the file itself says: --axes {own}"])
     samples = beginning(path, devices)
     if devices == 3 and lie(samples):  # until somebody takes them
         samples = beginning(path, devices, LONG)
     if wanted == "auto":
         found = guess(samples, devices=devices)
-        told = (found.grip if grip is None else grip, found.unit if unit is None else unit)
-        return found._replace(grip=told[0], unit=told[1])
+        return found._replace(grip=found.grip if grip is None else grip, unit=found.unit if unit is None else unit)
     lines = [f"{line}, or --axes auto" for line in judge(samples, wanted, grip, unit, order, devices)]
     return Choice(wanted, grip, unit, tuple(order), lines)
 

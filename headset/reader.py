@@ -108,6 +108,7 @@ class Reader:
     strict : a line that cannot be read is an error (files); otherwise it is skipped and counted (live streams), and
              100 of them in a row are an error.  A file's last line may be cut short: it is skipped
     devices : 3, or 1: the headset's columns alone
+    axes   : what a comment before the columns says they are ("# axes: openxr"), or None
     Test     tests/headset/test_stream.py::test_columns, test_garbage_lines, test_garbage_on_stdin, test_headset_only,
              test_time_columns
     """
@@ -118,7 +119,7 @@ class Reader:
         self.wanted = COLUMNS[: 1 + devices * len(PARTS)]
         self.line = self.unreadable = self.in_a_row = 0
         self.at = self.names = None
-        self.matrices, self.second = [], 1.0
+        self.matrices, self.second, self.axes = [], 1.0, None
 
     def read(self, lines):
         """Samples of an iterable of lines (bytes or text), one by one."""
@@ -131,6 +132,8 @@ class Reader:
                 raise UserError(f"{self.name}, line {self.line}: longer than {LINE_LIMIT} bytes; valid: a CSV's lines")
             cells = text.lstrip("\ufeff").strip()
             if not cells or cells.startswith("#"):
+                found = re.search(r"^#.*\baxes:? (\w+)", cells)
+                self.axes = self.axes or (found[1] if found else None)
                 continue
             if self.at is None:
                 if "\0" in text:

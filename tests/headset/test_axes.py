@@ -152,6 +152,10 @@ def test_choose(tmp_path):
         assert choose(path, name, grip=15.0).lines == [] and choose(path, grip=40.0).grip == 40.0
         wrong = choose(path, "unity" if name != "unity" else "openxr", grip=15.0)
         assert any("--axes auto" in line for line in wrong.lines) and wrong.axes != name
+        path.write_text(f"# mine; axes: {name}\n" + "".join(lines_of_user("unity")))  # what it says itself counts
+        assert choose(path).axes == name and choose(path, "unreal").axes == "unreal"
+        path.write_text("# axes: sideways\n" + "".join(lines_of_user(name)))  # and what is none does not
+        assert choose(path).axes == name
     assert choose("-").axes == "unity" and choose("-", "openxr").lines == []
     with pytest.raises(UserError, match="--axes north: unknown; valid: auto, unity"):
         choose(path, "north")

@@ -6,7 +6,7 @@
 import { CALIBRATION, CONTROL_RATE, Stream } from './calibration.js';
 import { choose } from './axes.js';
 import { Replay, isReplay } from './bsor.js';
-import { COLUMNS, GAP, Reader, UNIT, UserError, linesOf } from './reader.js';
+import { AXES, COLUMNS, GAP, Reader, UNIT, UserError, linesOf } from './reader.js';
 import { Player } from './player.js';
 import { Simulation, fetchCharacter, visualShapes } from './character.js';
 import { loadMujoco } from './mujoco.js';
@@ -70,7 +70,7 @@ function play(order) {
   const devices = order.alone ? 1 : sim.table.policy.devices;
   const [reader, samples] = opened(order, devices);
   const first = samples.next(); // the header, and a comment that says which axes
-  const options = { ...order, axes: reader.axes || order.axes };
+  const options = { ...order, axes: AXES[reader.axes] ? reader.axes : order.axes };
   if (options.axes === 'auto') {
     const found = isReplay(order.name) ? { axes: 'unity', lines: [] } : choose(() => opened(order, devices)[1], devices);
     Object.assign(options, found, { grip: order.grip ?? found.grip });
