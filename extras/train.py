@@ -88,7 +88,8 @@ class Curriculum(Uniform):
               the sequence uniform.  A share `retry` starts RETRY steps before a place where an episode failed of late.
               A share `begin` starts in the still frames before a visit, in sequences drawn by 1 + min(h / ⟨h⟩, MOST)
               with `balance`, evenly without.  Those stand in the default pose, and a share `stand` of all.
-              A share `even` of either kind is shared out evenly among the sets that sequences come from (`evened`)
+              A share `even` of the time and of the beginnings is the same for every set that sequences come from, and
+              within a set goes by frames × h, of beginnings by min(h / ⟨h⟩, MOST)  (`evened`)
     Symbols   h failures a step, of late (`count`); ⟨h⟩ its mean over frames; H horizon; T steps of an episode
     Why       after a while most failures are in a few sequences, and a uniform draw spends its steps on the others;
               within them they are at a few places, such as the first steps of a run.  And a policy that has always been
@@ -132,11 +133,10 @@ class Curriculum(Uniform):
         """Frames (n,): sequences by how often they are wanted, frames within them evenly."""
         ref = self.ref
         frames = np.maximum(ref.last - ref.first - 1, 0)  # that can be started from
-        p = frames.astype(float)
-        if self.balance:
-            h = np.maximum(self.failed / self.lived, 1e-6)
-            p *= (1.0 + h / np.average(h, weights=frames)) * h / -np.expm1(-h * self.horizon)
-        cdf = np.cumsum(evened(p, self.sets, self.even))
+        h = np.maximum(self.failed / self.lived, 1e-6)
+        steps = -np.expm1(-h * self.horizon) / h  # E[T]
+        time = frames * (1.0 + h / np.average(h, weights=frames) if self.balance else steps)
+        cdf = np.cumsum(evened(time, frames * h, self.sets, self.even) / steps)
         k = np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right")
         return ref.first[k] + 1 + (frames[k] * rng.random(n)).astype(int)
 
@@ -144,8 +144,9 @@ class Curriculum(Uniform):
         """Frames (n,) among the still ones at the beginning of the sequences that have some."""
         ref, k = self.ref, self.leads
         h = np.maximum(self.failed[k] / self.lived[k], 1e-6)
-        p = 1.0 + np.minimum(h / h.mean(), MOST) if self.balance else np.ones(len(k))
-        cdf = np.cumsum(evened(p, self.sets[k], self.even))
+        hard = np.minimum(h / h.mean(), MOST)
+        p = 1.0 + hard if self.balance else np.ones(len(k))
+        cdf = np.cumsum(evened(p, hard, self.sets[k], self.even))
         k = k[np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right").clip(0, len(k) - 1)]
         return ref.first[k] + 1 + (rng.random(n) * (ref.still[k] - 1)).astype(int)
 
@@ -177,16 +178,16 @@ class Curriculum(Uniform):
             getattr(self, name)[:] = value
 
 
-def evened(p, sets, share):
-    r"""Weights of which a share is spread evenly over sets.
+def evened(p, within, sets, share):
+    r"""Weights of which a share is the same for every set, whatever is in it.
 
-    Equation  p' = (1 − share) p / Σ p + share p / (K Σ_{own set} p),  K the sets that have any weight
-    Args      p : (S,) weights ≥ 0; sets : (S,) int; share in [0, 1]
+    Equation  p' = (1 − share) p / Σ p + share w / (K Σ_{own set} w),  K the sets that have any weight
+    Args      p, within : (S,) weights ≥ 0; sets : (S,) int; share in [0, 1]
     Returns   (S,), whose sum is 1
     Test      tests/extras/test_train.py::test_even_starts"""
-    total = np.bincount(sets, p)
+    total = np.bincount(sets, within)
     own = np.where(total > 0, total, 1.0)[sets] * np.count_nonzero(total)
-    return (1.0 - share) * p / p.sum() + share * p / own
+    return (1.0 - share) * p / p.sum() + share * within / own
 
 
 class Disturbance:

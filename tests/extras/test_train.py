@@ -150,21 +150,31 @@ def test_begun_starts(visited):
         Curriculum(walks, begin=0.4)
 
 
-def test_even_starts(char, visited, tmp_path):
-    """A share of the draws is the same for every set, whatever it holds; within a set the weights are as they were."""
-    p, sets = np.array([1.0, 3.0, 4.0, 0.0]), np.array([0, 0, 2, 3])
-    np.testing.assert_allclose(train.evened(p, sets, 0.0), p / 8)
-    np.testing.assert_allclose(train.evened(p, sets, 1.0), [1 / 8, 3 / 8, 4 / 8, 0])
-    np.testing.assert_allclose(train.evened(p, sets, 0.5), (train.evened(p, sets, 0) + train.evened(p, sets, 1)) / 2)
+def test_even_starts(visited, tmp_path):
+    """A share of the draws is the same for every set, whatever it holds; within a set most are where it fails."""
+    p, w, sets = np.array([1.0, 3.0, 4.0, 0.0]), np.array([2.0, 2.0, 1.0, 0.0]), np.array([0, 0, 2, 3])
+    np.testing.assert_allclose(train.evened(p, w, sets, 0.0), p / 8)
+    np.testing.assert_allclose(train.evened(p, w, sets, 1.0), [1 / 4, 1 / 4, 1 / 2, 0])
+    half = (train.evened(p, w, sets, 0) + train.evened(p, w, sets, 1)) / 2
+    np.testing.assert_allclose(train.evened(p, w, sets, 0.5), half)
 
     ref, n, rng, owner = visited, 20_000, np.random.default_rng(0), Uniform(visited).owner
-    frames = (ref.last - ref.first - 1) / np.sum(ref.last - ref.first - 1)
-    own = np.array([0, 1, 1, 1])
+    frames = (ref.last - ref.first - 1).astype(float)
     for begin, balance in ((0.0, False), (0.0, True), (1.0, False), (1.0, True)):
-        starts = Curriculum(ref, begin=begin, balance=balance, even=0.6, sets=own if not begin else 1 - own[::-1])
+        starts = Curriculum(ref, begin=begin, balance=balance, even=0.6, sets=[0, 1, 1, 0] if begin else [0, 1, 1, 1])
+        starts.failed[:], starts.lived[:] = [2, 1, 1, 3], 100.0
+        h = starts.failed / 100.0
+        if begin:  # sequences 2 and 3 have still frames; each is a set
+            base = 1.0 + np.minimum(h[2:] / h[2:].mean(), train.MOST) if balance else np.ones(2)
+            expected = [0, 0, *(0.4 * base / base.sum() + 0.6 * np.array([0.5, 0.5]))]
+        else:
+            steps = (1.0 - np.exp(-h * starts.horizon)) / h  # of an episode, on average
+            time = frames * (1.0 + h / np.average(h, weights=frames)) if balance else frames * steps
+            rest = 0.5 * (frames * h)[1:] / (frames * h)[1:].sum()
+            starts_of = (0.4 * time / time.sum() + 0.6 * np.array([0.5, *rest])) / steps
+            expected = starts_of / starts_of.sum()
         drawn = np.bincount(owner[starts.draw(rng, n)[0]], minlength=4) / n
-        expected = 0.4 * frames + 0.6 * np.array([0.5, *(0.5 * frames[1:] / frames[1:].sum())])
-        np.testing.assert_allclose(drawn, [0, 0, 0.5, 0.5] if begin else expected, atol=0.02)
+        np.testing.assert_allclose(drawn, expected, atol=0.015)
 
     (tmp_path / "a/deeper").mkdir(parents=True)
     for name in ("a/x_1.bvh", "a/deeper/y-2_01.bvh", "p_0.csv"):
