@@ -92,7 +92,7 @@ class Options(retarget.BvhFlags, StreamFlags, metrics.Options):
     png: str | None = arg(None, "write a contact sheet", check=PNG)
     video: str | None = arg(None, "write a video (.mp4; needs the extra `view`)")
     view: str | None = arg(
-        None, "show it live: window (MuJoCo's viewer) or web (in a browser)", choices=("window", "web")
+        None, "show it live: window (MuJoCo's viewer) or web (in a browser on this machine)", choices=("window", "web")
     )
     port: int = arg(0, "port of the browser viewer, 0 = the first free one from 8080", check=NONNEGATIVE)
     realtime: bool = arg(False, "play a stream at the wall clock's pace and report the deadlines missed")
@@ -239,10 +239,13 @@ def _shown_model(char: Character, ref: Reference):
     return spec.compile()
 
 
+LOOPBACK = "127.0.0.1"  # where the browser viewer listens
+
+
 def _open_viewer(model, data, root, how, port):
     """A handle with is_running(), sync(), close(). The camera follows the body `root`; collision shapes are hidden.
 
-    Test      tests/test_play_view.py::test_taken_port_is_named, test_window_needs_a_display
+    Test      tests/test_play_view.py::test_web_view, test_taken_port_is_named, test_window_needs_a_display
     """
     import warnings
 
@@ -271,14 +274,18 @@ def _open_viewer(model, data, root, how, port):
         from mujoco.studio import launch_thread, viewer_protocol, web_viewer
         from mujoco.studio.web import web_server
 
-        web_server.bind_public_socket("::", port).close()  # a taken port: seen here, not in the viewer's thread
+        web_server.bind_public_socket(LOOPBACK, port).close()  # a taken port: seen here, not in the viewer's thread
     except (ImportError, RuntimeError, OverflowError) as error:
         raise UserError(f"no page can be served on port {port}: {error}") from None
+
+    class Viewer(web_viewer.WebViewer):
+        # MuJoCo's would listen on all interfaces and asks for no password: its "::" is set, and passed over
+        _host = property(lambda self: LOOPBACK, lambda self, host: None)
 
     def serve(endpoint):
         camera, option = look(mujoco.MjvCamera(), mujoco.MjvOption())
         config = viewer_protocol.ViewerConfig(gfx="web", http_port=port)
-        page = web_viewer.WebViewer(config, endpoint, model=model, camera=camera, vis_options=option)
+        page = Viewer(config, endpoint, model=model, camera=camera, vis_options=option)
         viewer_protocol.run_viewer_loop(page)
 
     handle = launch_thread.launch_thread(serve)

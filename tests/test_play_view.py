@@ -87,6 +87,9 @@ def test_web_view(policy, tmp_path):
         status, program = get(f"http://localhost:{port}/web_client.wasm")
         assert status == 200 and program[:4] == b"\0asm"
         assert json.loads(get(f"http://localhost:{port}/model?total_bytes")[1])["total_bytes"] > 100_000
+        for elsewhere in ("127.0.0.2", "::1"):  # it would answer there if it listened on all interfaces
+            with pytest.raises(OSError):
+                socket.create_connection((elsewhere, port), timeout=5)
         wait_for("second run of the character", lambda: "; again" in log.read_text())
         server.send_signal(signal.SIGINT)
         assert server.wait(20) == 130
