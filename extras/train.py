@@ -47,7 +47,7 @@ SHORTEST = 1.0  # s of a clip that is made a visit
 RUNS = 2.0  # m/s, ASSUMED: a stitched sequence with a faster second is made visits, too
 PLAYERS_STAND = 1.5  # ASSUMED: s at a recording's beginning in which a player stands well enough to start under
 PUSH_SECONDS = 2.0  # mean time between pushes
-CODE = 2  # counts up when retargeting or augmenting changes what it makes: older caches are then made anew
+CODE = 3  # counts up when retargeting or augmenting changes what it makes: older caches are then made anew
 CHUNK = 100  # clips retargeted between two lines of progress
 
 

@@ -54,6 +54,17 @@ def warp(clip: Clip, speed: float) -> Clip:
     return resample(replace(clip, name=f"{clip.name}-speed{speed:.2f}", rate=clip.rate * speed), clip.rate)
 
 
+def reverse(clip: Clip) -> Clip:
+    r"""The clip played backwards: of somebody who walks, somebody who walks backwards.
+
+    Equation  p'(t) = p(T − t), and so all else
+    Source    joint angles of backward walking are nearly those of forward walking in reverse [Thorstensson 1986;
+              Winter, Pluck and Yang 1989]; a run's are not
+    Test      tests/mocap/test_mocap.py::test_reverse"""
+    flipped = {name: getattr(clip, name)[::-1].copy() for name in ("pos", "quat", "ball")}
+    return replace(clip, name=f"{clip.name}-reversed", still=0, **flipped)
+
+
 def resize(clip: Clip, height=1.0, arms=1.0, trunk=1.0) -> Clip:
     r"""The same motion by a user `height` times as tall, whose arms and trunk are `arms` and `trunk` times as long in
     proportion to the legs.
@@ -169,6 +180,7 @@ def augment(
 
 MOVING = 0.2  # m/s: a clip whose first frames have a faster headset or hand begins in motion
 LONGEST = 15.0  # s of a clip in one visit
+BACKWARDS, WALKS = 0.15, (0.4, 1.8)  # share of other users' walks that go backwards; m/s of a walk.  ASSUMED
 ACCELERATION = (1.2, 2.6)  # m/s², ASSUMED: with which a visitor who runs sets off; the row `streamed` has up to 2.7
 
 
@@ -254,12 +266,16 @@ def visits(clips: list[Clip], rng: np.random.Generator) -> list[Clip]:
               takes longer, standing 0.5 to 2.5 s at the end; longer clips in parts of LONGEST s, a rest shorter than
               half left out; the height that calibrates is that of the first pose in 70 % of the visits, otherwise
               between it and the user's who stands straight, with a deviation of 1.2 %
-    Why       a user who runs as fast as ever 0.8 s after standing loses every character, which then learns nothing
+    ASSUMED   a share BACKWARDS of the other users who walk do so backwards (`reverse`)
+    Why       nine captures of steps backwards are too few to learn them from, and every user makes some;
+              a user who runs as fast as ever 0.8 s after standing loses every character, which then learns nothing
     Test      tests/mocap/test_mocap.py::test_visits
     """
     n, out = round(LONGEST * clips[0].rate) if clips else 0, []
     parts = [c[a : a + n] for c in clips for a in range(0, max(len(c) - n // 2, 1), n)]
-    for clip in augment(parts, rng):
+    for k, clip in enumerate(augment(parts, rng)):
+        if k >= len(parts) and WALKS[0] < fastest_second(clip) < WALKS[1] and rng.random() < BACKWARDS:
+            clip = reverse(clip)
         rise = max(rng.uniform(0.8, 1.6), fastest_second(clip) / rng.uniform(*ACCELERATION))
         led = lead(clip, rng.uniform(0.6, 1.6), rise, rng.uniform(0.5, 2.5))
         share = 1.0 if rng.random() < 0.7 else rng.random()

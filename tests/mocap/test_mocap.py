@@ -1130,6 +1130,28 @@ def test_lead_against_scipy(out):
     np.testing.assert_allclose(led.pos[sets_off], standing.pos[sets_off], rtol=0, atol=1e-9)
 
 
+def test_reverse(monkeypatch):
+    """Backwards in every respect, twice is as before; of visits only other users' walks are, and not runs."""
+    clip = walk(4.0)
+    back = augment.reverse(clip)
+    for name in ("pos", "quat", "ball"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(clip, name)[::-1])
+        np.testing.assert_array_equal(getattr(augment.reverse(back), name), getattr(clip, name))
+
+    def ahead(c):  # m a frame, along its own heading
+        yaw = heading(c.quat[:-1, 0])
+        return np.mean(np.sum(np.diff(c.pos[:, 0, :2], axis=0) * np.stack([np.cos(yaw), np.sin(yaw)], 1), axis=1))
+
+    assert ahead(back) == pytest.approx(-ahead(clip), rel=0.02) and ahead(clip) > 0
+    monkeypatch.setattr(augment, "BACKWARDS", 1.0)
+    run, first = augment.warp(clip, 3.0), {name: getattr(clip, name)[:1] for name in ("pos", "quat", "ball")}
+    still = replace(clip, **{name: np.repeat(value, 90, axis=0) for name, value in first.items()})
+    names = [c.name for c in augment.visits([clip, still, run], np.random.default_rng(0))]
+    assert ["-reversed" in name for name in names] == [False, False, False, True, False, False]
+    monkeypatch.setattr(augment, "BACKWARDS", 0.0)
+    assert not any("-reversed" in c.name for c in augment.visits([clip], np.random.default_rng(0)))
+
+
 def test_visits():
     """Two visits a clip, by two people; each begins and ends still; long clips come in parts; the seed decides."""
     clips = [walk(4.0), walk(20.0)]
