@@ -95,10 +95,17 @@ class Character:
         return varied(self, mjcf.read_mjcf(self.xml), self.spec.get("pose", {}))
 
     @property
+    def upright(self):
+        """The default pose at the origin, looking along x, the soles on the floor.  qpos (nq,)
+
+        Test      tests/test_characters.py::test_upright"""
+        return np.concatenate([[0.0, 0.0, self.hip_height], self.rest[self.root], self.default])
+
+    @property
     def height(self):
         """Top of the collision shapes above the soles in the default pose [m]."""
         m, data = self.model, mujoco.MjData(self.model)
-        data.qpos[2], data.qpos[7:] = self.hip_height, self.default
+        data.qpos[:] = self.upright
         mujoco.mj_kinematics(m, data)
         geoms = np.flatnonzero(m.geom_conaffinity)
         middle = data.geom_xpos[geoms, 2]  # the shapes are symmetric: the top is as far above as the lowest point below
@@ -637,8 +644,7 @@ class OwnShapes:
         geoms = np.flatnonzero(m.geom_conaffinity)
         pairs = [(a, b) for i, a in enumerate(geoms) for b in geoms[i + 1 :] if not self._near(*m.geom_bodyid[[a, b]])]
         self.pairs = np.array(pairs, int).reshape(-1, 2)
-        rest = np.concatenate([[0.0, 0.0, char.hip_height], char.rest[char.root], char.default])
-        self._pose(rest)
+        self._pose(char.upright)
         self.pairs = self.pairs[[self._distance(a, b) > 0 for a, b in self.pairs]]
 
     def _near(self, a, b):

@@ -153,7 +153,7 @@ def headset(char: Character) -> np.ndarray:
 
     Test      tests/headset/test_stream.py::test_stand"""
     data = mujoco.MjData(char.model)
-    data.qpos[2], data.qpos[7:] = char.hip_height, char.default
+    data.qpos[:] = char.upright
     mujoco.mj_kinematics(char.model, data)
     return data.site_xpos[char.sensor_sites[0]].copy()
 

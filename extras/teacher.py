@@ -68,7 +68,7 @@ def inertia(char: Character) -> np.ndarray:
 
     Test      tests/extras/test_teacher.py::test_teacher_holds_an_arm"""
     m, data, full = char.model, mujoco.MjData(char.model), np.zeros((char.model.nv, char.model.nv))
-    data.qpos[2], data.qpos[3:7], data.qpos[7:] = char.hip_height, char.rest[char.root], char.default
+    data.qpos[:] = char.upright
     mujoco.mj_forward(m, data)
     mujoco.mj_fullM(m, data, full)
     return np.diag(full)[6 + char.driven].copy()

@@ -265,6 +265,17 @@ def test_solvers(name):
     assert 1e-6 < apart < 0.5
 
 
+def test_upright(chars):
+    """Both soles on the floor, the head above the root, the joints at their defaults; the body looks along x."""
+    for c in chars.values():
+        d = posed(c.model, c.upright)
+        assert abs(retarget.sole_points(c, d.geom_xpos[None], d.geom_xmat[None])[..., 2].min(axis=-1)).max() < 1e-9
+        np.testing.assert_array_equal(c.upright[7:], c.default)
+        left, right = d.xpos[c.feet]
+        assert left[1] > right[1] and abs(left[0] - right[0]) < 1e-9 and d.xpos[c.head, 2] > d.xpos[c.root, 2]
+        assert not c.upright[:2].any() and d.site_xpos[c.sensor_sites[0], 0] > 0
+
+
 def test_builds(chars):
     """What the issue of each body is: sizes, masses, the centre of mass over the feet, what hangs where."""
     part = lambda c, *names: sum(  # noqa: E731
@@ -279,7 +290,7 @@ def test_builds(chars):
     assert part(dino, "tail") > 0.15 * dino.model.body_subtreemass[0]
     assert oppy.hip_height / oppy.height < 0.36 < 0.5 < jesse.hip_height / jesse.height  # short legs
     for c in chars.values():
-        d = posed(c.model, [0, 0, c.hip_height, 1, 0, 0, 0, *c.default])
+        d = posed(c.model, c.upright)
         soles = retarget.sole_points(c, d.geom_xpos[None], d.geom_xmat[None])[0]
         com = d.subtree_com[c.root]
         assert soles[..., 0].min() + 0.02 < com[0] < soles[..., 0].max() - 0.02 and abs(com[1]) < 1e-6

@@ -75,7 +75,7 @@ def rotation_of(q):
 def resting_pairs(char):
     """Pairs of shapes that do not count: of one body, of bodies at most two joints apart, or overlapping at rest."""
     m, data, out = char.model, mujoco.MjData(char.model), set()
-    data.qpos[2], data.qpos[7:] = char.hip_height, char.default
+    data.qpos[:] = char.upright
     mujoco.mj_forward(m, data)
     geoms = [g for g in range(m.ngeom) if m.geom_conaffinity[g] and m.geom_bodyid[g]]
 
@@ -218,7 +218,7 @@ def test_field_units_against_slow_loop(char, ref):
     found, m, data = metrics.measure(char, ref, recordings), char.model, mujoco.MjData(char.model)
     body = {s: m.body("spine3" if s == "chest" else s).id for s in SEGMENTS}
     rest = mujoco.MjData(m)
-    rest.qpos[2], rest.qpos[7:] = char.hip_height, char.default
+    rest.qpos[:] = char.upright
     mujoco.mj_forward(m, rest)
     rests = {s: rotation_of(rest.xquat[b]) for s, b in body.items()}
     sums, phc, height = {k: [] for k in FIELD}, [], []

@@ -34,7 +34,7 @@ def physics(char):
     """240 steps from the default pose under sinusoidal controls."""
     m, data = char.model, mujoco.MjData(char.model)
     m.opt.timestep = 1 / 120
-    data.qpos[2], data.qpos[3:7], data.qpos[7:] = char.hip_height, char.rest[char.root], char.default
+    data.qpos[:] = char.upright
     start = data.qpos.copy()
     t, k = np.arange(STEPS)[:, None] / 120, np.arange(m.nu)
     controls = 0.1 * np.sin(2 * np.pi * (0.5 + 0.1 * k) * t + k)
