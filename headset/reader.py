@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from human import heading, quat_about, quat_conj, quat_matrix, quat_mul, quat_rotate, quat_slerp
 from mocap.data import CONTROL_RATE
+from mocap.guess import without_prefix
 from plumbing.cli import UserError
 from plumbing.files import kind_of, parse_number
 from retarget import Reference
@@ -48,41 +49,69 @@ _HELD = ("hand", "controller", "touch", "wand", "index", "anchor", "device", "tr
 _POSITION = ("p", "pos", "position", "loc", "location", "translation")
 _ROTATION = ("q", "quat", "quaternion", "rot", "rotation", "ori", "orient", "orientation")
 _MATRIX = ("m", "mat", "matrix", "pose", "transform")
-_WORD = "|".join(sorted((*_HEAD, *_SIDES, *_HELD, *_POSITION, *_ROTATION, *"xyzw"), key=len, reverse=True))
-_TIME = re.compile(r"(?:delta|elapsed|session|system)?(?:time|timestamp|t)(s|sec|seconds|ms|us|ns|milliseconds)?")
+_LOOSE = ("l", "r", "t", "local", "world", "global", "knuckles", "oculus", "quest", "vive", "camera")
+_WORD, _LOOSE_WORD = (
+    "|".join(sorted((*_HEAD, *_SIDES, *_HELD, *_POSITION, *_ROTATION, *"xyzw", *more), key=len, reverse=True))
+    for more in ((), _LOOSE)
+)
+_TIME = re.compile(
+    r"(?:delta|elapsed|session|system|unix|epoch|utc)?(?:time|timestamp|t)(s|sec|seconds|ms|us|ns|milliseconds)?"
+)
 _SECONDS = {"ms": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "ns": 1e-9}
+_METRES = "(?:c|m)?m|(?:centi|milli)?met(?:re|er)s?"
+_LENGTH = re.compile(rf"[\[(](?:{_METRES})[\])]|[_ ](?:{_METRES})$", re.I)
 
 
-def column(name: str) -> str | None:
+def column(name: str, loose=False) -> str | None:
     """The canonical name of a column, or None for one that is not ours: "HeadPosX", "left hand.rotation.w" …
 
     Rule      the words of a device, of position or rotation, and an axis; in any order and case, with or without
               anything between them; without position or rotation x, y, z are a position.  A pose as a matrix has its
-              row and column: "hmd_m03", "left_matrix[1][2]"
+              row and column: "hmd_m03", "left_matrix[1][2]".  loose: also l and r for the hands, tx for a position, a
+              camera for the head, and makers' names; for files that lack columns otherwise
     Test      tests/headset/test_stream.py::test_columns, tests/headset/test_columns.py::test_any_order_and_case"""
-    text = re.sub(r"[\[(](?:c|m)?m[\])]|[_ ](?:c|m)?m$", "", name.strip().strip('"'))  # a length's unit
+    text = _LENGTH.sub("", name.strip().strip('"'))
     letters = re.sub(r"[^a-z]", "", text.lower())
     if _TIME.fullmatch(re.sub(r"[^a-z]", "", name.lower())):
         return "time"
     if re.search(r"\d", text):
         return _matrix_column(letters, re.findall(r"\d", text))
-    words = _words(letters)
+    words = _words(letters, loose)
     device, axis = _device(words), [w for w in words if w in tuple("xyzw")]
-    turns, moves = (any(w in kind for w in words) for kind in (_ROTATION, _POSITION))
+    turns, moves = (any(w in kind for w in words) for kind in (_ROTATION, (*_POSITION, "t")))
     if not device or len(axis) != 1 or (turns and moves) or (axis == ["w"] and not turns):
         return None
     return f"{device}_{'q' if turns else 'p'}{axis[0]}"
 
 
-def _words(letters) -> list[str]:
+def _words(letters, loose=False) -> list[str]:
     """The words that, one after the other, make up the letters; none if they do not, or if they are too many."""
-    found = re.findall(_WORD, letters) if len(letters) < 80 else []
+    found = re.findall(_LOOSE_WORD if loose else _WORD, letters) if len(letters) < 80 else []
     return found if "".join(found) == letters else []
 
 
 def _device(words) -> str | None:
-    devices = {"head" for w in words if w in _HEAD} | {w for w in words if w in _SIDES}
+    devices = {"head" for w in words if w in (*_HEAD, "camera")} | {s for w in words for s in _SIDES if w in (s, s[0])}
     return devices.pop() if len(devices) == 1 else None
+
+
+def columns(names, wanted) -> list:
+    """`column` of each name: as it stands, loosely, or without what nearly all begin with: the first that gives all of
+    the wanted ones.
+
+    Test      tests/headset/test_columns.py::test_what_all_columns_share"""
+    bare = without_prefix(names)
+    ways = [[column(n) for n in names], [column(n, True) for n in names], [column(n, True) for n in bare]]
+    twice = lambda way: any(k > 1 for c, k in Counter(way).items() if c and c != "time")  # noqa: E731
+    return next((way for way in ways if set(wanted) <= told(way) and not twice(way)), ways[0])
+
+
+def told(known) -> set:
+    """The columns that are there, those that follow from a matrix among them.
+
+    Test      tests/headset/test_columns.py::test_matrices"""
+    whole = [d for d in DEVICES if {f"{d}_m{i}{j}" for i in range(3) for j in range(4)} <= set(known)]
+    return {*known, *(f"{d}_{p}" for d in whole for p in PARTS)}
 
 
 def _matrix_column(letters, digits) -> str | None:
@@ -178,10 +207,10 @@ class Reader:
     def header(self, line):
         """The first line: where which column is."""
         self.names = [c.strip() for c in line.split(",")]
-        known = [column(c) for c in self.names]
+        known = columns(self.names, self.wanted[1:])
         ours = lambda mark: sum(c is not None for c in map(column, line.split(mark)))  # noqa: E731
         mark = max(SEPARATORS, key=ours)
-        if ours(mark) > max(ours(","), 1):
+        if ours(mark) > max(len(known) - known.count(None), 1):
             valid = "commas, and points in the numbers"
             raise UserError(f"{self.name}, line {self.line}: {SEPARATORS[mark]} between the columns; valid: {valid}")
         used = DEVICES[: len(self.wanted) // len(PARTS)]
@@ -189,8 +218,7 @@ class Reader:
         self.matrices = [
             (k, [known.index(c) for c in names]) for k, names in enumerate(entries) if set(names) <= set(known)
         ]
-        told = {f"{DEVICES[k]}_{p}" for k, _ in self.matrices for p in PARTS}
-        missing = [c for c in self.wanted[1:] if c not in known and c not in told]
+        missing = [c for c in self.wanted[1:] if c not in told(known)]
         twice = [c for c, k in Counter(known).items() if c and k > 1 and c != "time"]
         if twice:
             raise UserError(f"{self.name}, line {self.line}: column {twice[0]} is there twice; valid: once each")

@@ -45,7 +45,7 @@ class Bvh:
     names: tuple[str, ...]  # (J,) unique, in file order: a parent always precedes its children
     parents: np.ndarray  # (J,) int, -1 for the root, which is joint 0
     offsets: np.ndarray  # (J, 3) float64 OFFSET from the parent
-    end_sites: dict[str, np.ndarray]  # joint name -> (3,) float64 offset of its End Site (the first, if several)
+    end_sites: dict[str, np.ndarray]  # joint name -> (3,) float64 offset of its End Site (the farthest, if several)
     channels: tuple[tuple[str, ...], ...]  # (J,) each joint's channel names in file order, out of CHANNELS
     values: np.ndarray  # (T, C) float64, raw
     frame_time: float  # [s]
@@ -230,7 +230,7 @@ def _parse_hierarchy(path, text, end):
             if top.channels is None and not top.site:
                 _fail(path, f"{top.label} has no CHANNELS; expected 'CHANNELS n NAME...' (n = 0 if it is fixed)", line)
             if top.site:
-                end_sites.setdefault(top.name, top.offset)
+                end_sites[top.name] = max(end_sites.get(top.name, top.offset), top.offset, key=np.linalg.norm)
             stack.pop()
         else:
             valid = "one OFFSET, '}'" if top.site else "one OFFSET, one CHANNELS, JOINT NAME, End Site, '}'"

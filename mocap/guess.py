@@ -35,14 +35,19 @@ _WORDS = {  # what joints are called, side and decoration apart; the first that 
     "shin": ("lowerleg", "lowleg", "shin", "calf", "tibia", "knee", "leg"),
     "foot": ("ankle", "foot"),
     "ball": ("toebase", "toe", "toes", "ball", "foot"),
-    "upper_arm": ("upperarm", "uparm", "humerus", "arm", "shldr", "shoulder"),
-    "forearm": ("forearm", "lowerarm", "lowarm", "radius", "elbow"),
+    "upper_arm": ("upperarm", "uparm", "uarm", "humerus", "arm", "shldr", "shoulder"),
+    "forearm": ("forearm", "lowerarm", "lowarm", "farm", "radius", "elbow"),
     "hand": ("wrist", "hand"),
 }
+_KNOWN = {w for each in _WORDS.values() for w in each}
 _LEG, _ARM = ("thigh", "shin", "foot", "ball"), ("upper_arm", "forearm", "hand")
-_SIDES = {"l": "l", "left": "l", "lft": "l", "r": "r", "right": "r", "rgt": "r"}
+_LEFT = "l left lft lf lt links gauche izq izquierda izquierdo sx sinistra"
+_RIGHT = "r right rgt rt rechts droite droit der derecha derecho dx destra"
+_SIDES = dict.fromkeys(_LEFT.split(), "l") | dict.fromkeys(_RIGHT.split(), "r")
+_FIRST = ("upper", "lower", "up", "low", "fore")  # "arm_upper" is the upper arm
+_REGION = re.compile("(leg|arm)(.+)")  # "leg_knee" is the knee
 _DECORATION = {
-    "joint", "jnt", "bone", "bip", "biped", "mixamorig", "def", "org", "character", "rig", "b", "j", "m", "avg",
+    "joint", "jnt", "bone", "bip", "biped", "mixamorig", "def", "org", "character", "rig", "b", "j", "m", "avg", "bend",
 }  # fmt: skip
 
 
@@ -53,15 +58,16 @@ def read_name(name: str):
     """
     parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name.rsplit(":", 1)[-1])
     words = [w for w in map(str.lower, parts) if w not in _DECORATION]
+    words = words if "LF" not in parts else ["".join(words)]  # "LFArm" is a left forearm
     side = next((_SIDES[w] for w in words if w in _SIDES), "")
-    word = "".join(w for w in words if w not in _SIDES)
-    if not side:
-        known = {w for each in _WORDS.values() for w in each}
-        for pattern in (r"(left|right)(.+)", r"(l|r)(.+)"):  # without capitals: "leftupleg", "lfemur"
-            found = re.fullmatch(pattern, word)
-            if found and found[2] in known:
-                return _SIDES[found[1]], found[2]
-    return side, word
+    word = "".join(sorted((w for w in words if w not in _SIDES), key=lambda w: w not in _FIRST))
+    if not side:  # without capitals: "leftupleg", "lfemur", "uplegleft"
+        for given in _SIDES:
+            for rest in (word.removeprefix(given), word.removesuffix(given)):
+                if rest != word and rest in _KNOWN:
+                    return _SIDES[given], rest
+    found = _REGION.fullmatch(word)
+    return side, found[2] if found and found[2] in _KNOWN and word not in _KNOWN else word
 
 
 SHARED = 0.8  # of the joints: a prefix or suffix that so many have is decoration.  ASSUMED
@@ -73,14 +79,16 @@ def bare_names(names) -> list[str]:
     Test      tests/mocap/test_mend.py::test_any_prefix_or_suffix, ::test_bare_names"""
     names = [re.sub(r"\d+", "_", n) for n in names]
     for _ in range(2):  # a suffix may hide behind another: "Hips:rig_01"
-        names = _without_prefix(names)
-        names = [n[::-1] for n in _without_prefix([n[::-1] for n in names])]
+        names = without_prefix(names)
+        names = [n[::-1] for n in without_prefix([n[::-1] for n in names])]
         names = [n.rsplit(":", 1)[-1] for n in names]
     return names
 
 
-def _without_prefix(names):
-    """Names without the longest beginning that nearly all share: in order of the alphabet they surround the middle."""
+def without_prefix(names) -> list[str]:
+    """Names without the longest beginning that nearly all share: in order of the alphabet they surround the middle.
+
+    Test      tests/mocap/test_mend.py::test_bare_names, tests/headset/test_columns.py::test_what_all_columns_share"""
     if len(names) < 5:
         return names
     middle = sorted(names)[len(names) // 2][:100]
@@ -97,7 +105,7 @@ def guess(b: bvh.Bvh, joints=None, balls=None):
 
     Args      joints : segment -> joint, and balls : (left, right) or None: what is known already
     Returns   joints, balls : completed as far as possible;  missing : segments (and ball_l, ball_r) that were not found
-    Test      tests/mocap/test_rigs.py::test_any_rig, ::test_partial_joint_map
+    Test      tests/mocap/test_rigs.py::test_any_rig, ::test_partial_joint_map, tests/mocap/test_mend.py::test_no_hands
     """
     ways = [_guess(b, [read_name(n) for n in names], joints, balls) for names in (bare_names(b.names), b.names)]
     return min(ways, key=lambda way: len(way[2]))
@@ -124,9 +132,9 @@ def _guess(b, named, joints, balls):
         return frozenset(found)
 
     def distinct(fits):
-        """Of joints of one name the first; of a chain of them in one place the last: it is what turns the bone."""
+        """Of joints of the best name the first; of a chain of fitting ones in one place the last: it turns the bone."""
         chosen = fits[0]
-        for j in fits[1:]:
+        for j in sorted(fits[1:]):
             between = above(j) - above(chosen)
             here = length[chosen] <= tiny or sum(length[i] for i in between) <= tiny
             if chosen in above(j) and here:
@@ -141,18 +149,13 @@ def _guess(b, named, joints, balls):
             for part in limb:
                 key = f"{part}_{side}"
                 fits = [
-                    fits
+                    j
                     for word in _WORDS[part]
-                    if (
-                        fits := [
-                            j
-                            for j, name in enumerate(named)
-                            if name == (side, word) and b.names[j] not in joints.values() and top < above(j)
-                        ]
-                    )
+                    for j, name in enumerate(named)
+                    if name == (side, word) and b.names[j] not in joints.values() and top < above(j)
                 ]
                 if key not in joints and fits:
-                    joints[key] = b.names[distinct(fits[0])]
+                    joints[key] = b.names[distinct(fits)]
                 if key in joints:
                     top = above(index[joints[key]])
         foot, ball = joints.get(f"foot_{side}"), joints.get(f"ball_{side}")
@@ -166,6 +169,9 @@ def _guess(b, named, joints, balls):
                 joints[f"ball_{side}"] = b.names[children[0]]
             elif np.linalg.norm(b.end_sites.get(foot, np.zeros(3))) > 0:
                 joints[f"ball_{side}"] = f"{foot}.end"
+        forearm = joints.get(f"forearm_{side}")
+        if f"hand_{side}" not in joints and np.linalg.norm(b.end_sites.get(forearm, np.zeros(3))) > tiny:
+            joints[f"hand_{side}"] = f"{forearm}.end"
     for part, limb in (("pelvis", "thigh"), ("chest", "upper_arm")):
         pair = [joints.get(f"{limb}_{side}") for side in "lr"]
         if part not in joints and all(pair):
@@ -176,8 +182,8 @@ def _guess(b, named, joints, balls):
     heads = [j for j, (side, word) in enumerate(named) if not side and word.endswith("head") and trunk < above(j)]
     if "head" not in joints and heads:
         joints["head"] = b.names[min(heads, key=lambda j: named[j][1] != "head")]
-    elif "head" not in joints and trunk and (neck := _neck_end(b, named, joints, above, length)):
-        joints["head"] = neck
+    elif "head" not in joints and trunk and (head := _headless(b, named, joints, above, length, tiny)):
+        joints["head"] = head
     balls = tuple(joints.pop(f"ball_{side}", None) for side in "lr")
     missing = [s for s in SEGMENTS if s not in joints] + [f"ball_{s}" for s, n in zip("lr", balls) if not n]
     return {s: joints[s] for s in SEGMENTS if s in joints}, balls, missing
@@ -186,18 +192,22 @@ def _guess(b, named, joints, balls):
 NECK = 0.35  # of a shin: what is longer reaches to the top of the head
 
 
-def _neck_end(b, named, joints, above, length):
-    """Where the head sits on a rig that ends at the neck: the neck's End Site, or the neck where that is too far up.
+def _headless(b, named, joints, above, length, tiny):
+    """What is the head of a rig without a joint of that name: of the one chain above the arms the bone behind the neck,
+    or the last; of a chain that ends at the neck its End Site, or the neck where that is too far up.
 
     ASSUMED   the head turns as the neck does
-    Test      tests/mocap/test_mend.py::test_no_head
+    Test      tests/mocap/test_mend.py::test_no_head, ::test_head_of_another_name
     """
     chest = b.names.index(joints["chest"])
     limbs = set().union(*(above(b.names.index(n)) for n in joints.values() if n in b.names))
     free = [j for j, (side, _) in enumerate(named) if not side and j not in limbs and above(chest) < above(j)]
     neck = free[-1] if free else chest  # of the trunk's joints the last
-    if "neck" not in named[neck][1]:  # a single joint above the arms is the head, whatever its name
-        return b.names[neck] if len(free) == 1 else None
+    if "neck" not in named[neck][1]:  # of another name: one chain, without joints that only say where its bone ends
+        chain = all(b.parents[j] == i for i, j in zip(free, free[1:]))
+        behind = [j for i, j in zip(free, free[1:]) if "neck" in named[i][1]]
+        bones = [j for j in free if j in b.parents or np.linalg.norm(b.end_sites.get(b.names[j], np.zeros(3))) > tiny]
+        return b.names[(behind or bones or free)[-1]] if free and chain else None
     end, shin = np.linalg.norm(b.end_sites.get(b.names[neck], np.zeros(3))), joints.get("foot_l")
     short = shin not in b.names or end <= NECK * length[b.names.index(shin)]
     if end > 0 and (short or neck == chest):
@@ -292,8 +302,13 @@ def unknown_rig(b, group, reading):
     ]
     if pairs:
         say(b.path, f"rig guessed from the joints' names: {', '.join(pairs)}", warning=False)
-    if "head" not in given and "head" not in joints["head"].lower():
-        say(b.path, f"no joint for the head: {joints['head']} is taken for it; another: --joint-map")
+    called = ["head"] * ("head" not in joints["head"].lower()) + [
+        s for s in ("hand_l", "hand_r") if joints[s] == f"{joints[s.replace('hand', 'forearm')]}.end"
+    ]
+    for segment in called:
+        if segment not in given:
+            what = segment if segment[-2] == "_" else f"the {segment}"
+            say(b.path, f"no joint for {what}: {joints[segment]} is taken for it; another: --joint-map")
 
     poses = [pose_of(each) for each in group]
     names = poses[0][0]

@@ -41,7 +41,7 @@ from human import (
     quat_rotate,
 )
 from mocap import amc, bvh
-from mocap.mend import REST_SEEN, doubt_rate, floor_of, leading_rest, may_rest
+from mocap.mend import ANKLE, REST_SEEN, doubt_rate, floor_of, leading_rest, may_rest
 from plumbing.cli import UserError, printable
 
 # ------------------------------------------------------------------------------------ known rigs
@@ -158,7 +158,9 @@ RIGS = {
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "cmu": 0.0254 / 0.45}
 UPS = ("x", "y", "z", "-x", "-y", "-z")
-HIPS = (0.6, 1.2)  # m, height of a standing adult's hips; its ends' ratio is less than that of any two units
+HIPS = (0.6, 1.2)  # m, height of a standing human's hips; its ends' ratio is less than that of any two units
+ADULTS = (0.8, 1.1)  # m, the same of who is 1.5 to 2.1 m tall.  ASSUMED: files in inches are of adults
+RARE = ("in", "cmu")  # units that a figure drawn to taste is taken for only with an adult's hips
 
 
 @dataclass(frozen=True)
@@ -392,7 +394,7 @@ def find_unit(pos):
     r"""The unit in which the hips are as high as a standing adult's.
 
     Height    thigh + shin + the ankle's lowest height over the floor: over the file's 0 where the balls rest within a
-              twelfth of the legs' length of it, else over the balls
+              twelfth of the legs' length of it, else over the balls, as far as ankles stand above them (ANKLE)
     Args      pos : (T, 17, 3) segments' joints and balls of the feet, z up, file units
     Returns   metres a unit; the unit's name, or None where none fits: then the hips are made 0.9 m high (ASSUMED: of
               a figure drawn to taste nothing else is known); the hips' height [file units]
@@ -402,9 +404,10 @@ def find_unit(pos):
     legs = np.mean([length(f"thigh_{s}", f"shin_{s}") + length(f"shin_{s}", f"foot_{s}") for s in "lr"])
     ankle = np.mean(np.percentile(pos[:, FEET, 2], 5, axis=0))
     ball = np.mean(np.percentile(pos[:, 15:17, 2], 5, axis=0))
-    hips = float(legs + (ankle if abs(ball) < legs / 12 else max(ankle - ball, 0.0)))
+    hips = float(legs + (ankle if abs(ball) < legs / 12 else np.clip(ankle - ball, 0.0, ANKLE * legs)))
     for name, unit in UNITS.items():
-        if HIPS[0] <= hips * unit <= HIPS[1]:
+        low, high = ADULTS if name in RARE else HIPS
+        if low <= hips * unit <= high:
             return unit, name, hips
     return ADULT / max(hips, 1e-9), None, hips
 
@@ -421,7 +424,8 @@ def _adult(path, clip, unit):
 def unit_line(unit, name, hips) -> str:
     """What is said of a unit that was found.  Test: tests/mocap/test_mend.py::test_any_scale"""
     if name:
-        return f"unit {name}: the hips of a standing adult are 0.6 to 1.2 m high, these {hips * unit:.2f} m"
+        low, high = ADULTS if name in RARE else HIPS
+        return f"unit {name}: the hips of a standing adult are {low} to {high} m high, these {hips * unit:.2f} m"
     return f"hips {hips:.4g} units high: scaled to an adult's {ADULT} m, {unit:.4g} m a unit; another: --unit"
 
 
@@ -612,12 +616,13 @@ def skeleton_beside(path):
     """The .asf files that may belong to an .amc file, best first; those equally good are all given.
 
     Rule      SUBJECT.asf for SUBJECT_TRIAL.amc; else the longest name with which the motion's begins; else, for
-              `09_06-run.amc`, those of subject 09 (`09-run.asf`), of several those with the same suffix; else a single
-              one of any name
+              `09_06-run.amc`, those of subject 09 (`09-run.asf`, `9.asf`), of several those with the same suffix; else
+              a single one of any name
     Test      tests/mocap/test_amc.py::test_skeleton_beside, tests/mocap/test_mend.py::test_skeletons_with_suffixes
     """
     beside = sorted(f for f in path.parent.glob("*") if f.suffix.lower() == ".asf")
-    stem, words = path.stem.lower(), lambda name: re.findall(r"[^\W_]+", name.lower())
+    stem = path.stem.lower()
+    words = lambda name: [w.lstrip("0") or w for w in re.findall(r"[^\W_]+", name.lower())]  # noqa: E731
     subject = stem.rpartition("_")[0] or stem
     found = [f for f in beside if f.stem.lower() == subject]
     begins = [f for f in beside if re.match(re.escape(f.stem.lower()) + r"(?![^\W_])", stem)]

@@ -8,7 +8,7 @@ from test_stream import standing, to_csv
 import character
 from headset import axes
 from headset.calibration import Stream
-from headset.reader import COLUMNS, Reader, column, time_unit
+from headset.reader import COLUMNS, Reader, column, columns, time_unit
 from plumbing.cli import UserError
 
 FORMS = {  # one name of a position and one of a rotation, of head and of left
@@ -27,6 +27,32 @@ FORMS = {  # one name of a position and one of a rotation, of head and of left
 @pytest.mark.parametrize("form", FORMS)
 def test_any_order_and_case(form):
     assert [column(n) for n in FORMS[form]] == ["head_px", "head_qw", "left_pz", "left_qy"]
+
+
+LOOSE = {  # forms that are read only where a file lacks columns otherwise: head, left, position, rotation
+    "letters": ("head", "l", "pos", "rot"),
+    "hands": ("HMD", "L_Hand", "Position", "Quat"),
+    "t": ("head", "left", "t", "q"),
+    "local": ("CenterEyeAnchor", "LeftHandAnchor", "localPosition", "localRotation"),
+    "makers": ("vive headset", "left vive wand", "pos", "rot"),
+    "prefix": ("player1.Head", "player1.LeftTouch", "Pos", "Orientation"),
+    "metres": ("head", "left", "pos", "rot"),
+}
+
+
+@pytest.mark.parametrize("form", LOOSE)
+def test_what_all_columns_share(form):
+    """Sides as letters, makers' names, a prefix that all share, in any order; a column that is plain wins over them."""
+    head, left, position, rotation = LOOSE[form]
+    right = left.replace("Left", "Right").replace("left", "right") if "eft" in left else left.replace("l", "r", 1)
+    right = right if right != left else left.replace("L", "R")
+    devices, unit = dict(zip(("head", "left", "right"), (head, left, right))), " [Meters]" if form == "metres" else ""
+    want = list(COLUMNS[1:])[::-1]
+    names = [f"{devices[c.split('_')[0]]} {position if '_p' in c else rotation}{c[-1]}" for c in want]
+    names = [n + unit * ("_p" in c) for n, c in zip(names, want)]
+    assert columns(["unix time (ms)", *names, "frame"], COLUMNS[1:]) == ["time", *want, None]
+    both = [*COLUMNS[1:], "l_pos_x", "local_head_pos_x", "camera_x"]
+    assert columns(both, COLUMNS[1:]) == [*COLUMNS[1:], None, None, None]
 
 
 @pytest.mark.parametrize("name", [

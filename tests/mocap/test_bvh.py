@@ -146,6 +146,9 @@ def test_small_file(tmp_path):
     assert clip.names == ("Hips", "Knee") and clip.parents.tolist() == [-1, 0]
     assert clip.offsets.tolist() == [[1, 2, 3], [0, -4, 0]]
     assert list(clip.end_sites) == ["Knee"] and clip.end_sites["Knee"].tolist() == [0, -5, 0]
+    heel = SMALL.replace("        End Site\n", "        End Site { OFFSET 0 -1 -2 }\n        End Site\n")
+    (tmp_path / "heel.bvh").write_text(heel)
+    assert bvh.read(tmp_path / "heel.bvh").end_sites["Knee"].tolist() == [0, -5, 0]  # of several the farthest
     assert clip.channels[1] == ("Zrotation", "Xrotation", "Yrotation")
     assert clip.values.tolist() == [[10.0 * i for i in range(1, 10)], [10.0 * i + 1 for i in range(1, 10)]]
     assert clip.frame_time == 0.04 and clip.path.endswith("clip.bvh")

@@ -45,44 +45,71 @@ def test_bare_names():
     assert guess.bare_names(["a_x", "a_y"]) == ["a_x", "a_y"] and guess.bare_names([]) == []
 
 
-def test_no_head(tmp_path, capsys):
-    """A rig that ends at the neck: the head is where the neck ends, and it is said."""
-    clip = walk(2.0)
-    write_rig(tmp_path / "a.bvh", clip, "xsens")
-    b = bvh.read(tmp_path / "a.bvh")
-    head = b.names.index("Head")
-    keep = [j for j in range(len(b.names)) if j != head]
+def cut(path, source, *leaves):
+    """Write a BVH without some of its last joints; their parents end where these were."""
+    b = bvh.read(source)
+    gone = [b.names.index(n) for n in leaves]
+    keep = [j for j in range(len(b.names)) if j not in gone]
     moved = {old: new for new, old in enumerate(keep)}
     local_pos, local = bvh.local(b)
-    bvh.write(tmp_path / "b.bvh", [b.names[j] for j in keep], [moved.get(b.parents[j], -1) for j in keep],
-              b.offsets[keep], b.frame_time, local_pos[:, 0], local[:, keep], {"Neck": b.offsets[head]})  # fmt: skip
-    got, want = data.from_bvh(tmp_path / "b.bvh"), data.from_bvh(tmp_path / "a.bvh")
+    ends = {b.names[b.parents[j]]: b.offsets[j] for j in gone}
+    bvh.write(path, [b.names[j] for j in keep], [moved.get(b.parents[j], -1) for j in keep],
+              b.offsets[keep], b.frame_time, local_pos[:, 0], local[:, keep], ends)  # fmt: skip
+    return path
+
+
+def test_no_head(tmp_path, capsys):
+    """A rig that ends at the neck: the head is where the neck ends, and it is said."""
+    write_rig(tmp_path / "a.bvh", walk(2.0), "xsens")
+    got = data.from_bvh(cut(tmp_path / "b.bvh", tmp_path / "a.bvh", "Head"))
     assert "no joint for the head: Neck.end is taken for it; another: --joint-map" in capsys.readouterr().err
-    np.testing.assert_allclose(got.pos[:, 2], want.pos[:, 2], atol=1e-6)
+    np.testing.assert_allclose(got.pos[:, 2], data.from_bvh(tmp_path / "a.bvh").pos[:, 2], atol=1e-6)
+
+
+def test_no_hands(tmp_path, capsys):
+    """A rig that ends at the forearms: hands are where these end, and it is said."""
+    write_rig(tmp_path / "a.bvh", walk(2.0), "xsens")
+    got = data.from_bvh(cut(tmp_path / "b.bvh", tmp_path / "a.bvh", "LeftWrist", "RightWrist"))
+    err = capsys.readouterr().err
+    assert "no joint for hand_l: LeftElbow.end is taken for it; another: --joint-map" in err
+    assert "joint for the head" not in err
+    np.testing.assert_allclose(got.pos, data.from_bvh(tmp_path / "a.bvh").pos, atol=1e-6)
+
+
+@pytest.mark.parametrize("neck, head", [("Spine5", "Spine6"), ("Neck", "Kopf"), ("spine.005", "spine.006")])
+def test_head_of_another_name(tmp_path, capsys, neck, head):
+    """The last bone above the arms, or what is behind the neck; what only says where it ends is no bone."""
+    write_rig(tmp_path / "a.bvh", walk(2.0), "mixamo", rename={"mixamorig:Neck": neck, "mixamorig:Head": head})
+    assert degrees_off(turned_alike(data.from_bvh(tmp_path / "a.bvh"), walk(2.0)), walk(2.0)).max() < 6
+    assert f"no joint for the head: {head} is taken for it" in capsys.readouterr().err
 
 
 # ---------------------------------------------------------------- joints in one place, other axes
 
 
-@pytest.mark.parametrize("first", (True, False))
-def test_zero_offset_joints(tmp_path, first):
-    """LHipJoint in the hips' place before LeftHip, or behind it in its place: the thigh is what turns the leg."""
+@pytest.mark.parametrize(
+    "joint, extra, first",
+    [("Hip", "HipJoint", True), ("Hip", "HipJoint", False), ("Ankle", "Foot", False), ("Wrist", "Hand", False)],
+)
+def test_zero_offset_joints(tmp_path, joint, extra, first):
+    """LHipJoint in the hips' place before LeftHip, or behind it in its place: the thigh is what turns the leg; so, too,
+    feet and hands."""
     clip = walk(3.0)
     write_rig(tmp_path / "a.bvh", clip, "xsens")
     b = bvh.read(tmp_path / "a.bvh")
     pos, quat = bvh.local(b)
     names, parents, offsets, local, new = [], [], [], [], {}
     for j, name in enumerate(b.names):
-        side, hip = name[0], name in ("LeftHip", "RightHip")
+        side, hip = name[0], name in (f"Left{joint}", f"Right{joint}")
         if hip and first:
-            names.append(f"{side}HipJoint"), parents.append(new[b.parents[j]]), offsets.append(np.zeros(3))
+            names.append(f"{side}{extra}"), parents.append(new[b.parents[j]]), offsets.append(np.zeros(3))
             local.append(np.tile([1.0, 0, 0, 0], (len(clip), 1)))
         new[j] = len(names)
         names.append(name), parents.append(len(names) - 2 if hip and first else new.get(b.parents[j], -1))
         offsets.append(b.offsets[j])
         local.append(np.tile([1.0, 0, 0, 0], (len(clip), 1)) if hip and not first else quat[:, j])
         if hip and not first:
-            names.append(f"{side}HipJoint"), parents.append(new[j]), offsets.append(np.zeros(3))
+            names.append(f"{side}{extra}"), parents.append(new[j]), offsets.append(np.zeros(3))
             local.append(quat[:, j])
             new[j] = len(names) - 1
     bvh.write(tmp_path / "b.bvh", names, parents, offsets, b.frame_time, pos[:, 0], np.stack(local, 1), b.end_sites)
@@ -158,6 +185,10 @@ def test_floor(tmp_path, capsys, off):
         np.testing.assert_allclose(got.pos[..., 2], clip.pos[..., 2], atol=0.03)
         np.testing.assert_allclose(data.from_bvh(path, Reading(floor="file")).pos[..., 2], moved.pos[..., 2], atol=2e-3)
         assert "feet rest" not in capsys.readouterr().err
+    deep = replace(moved, ball=moved.ball - [0, 0, 0.1])  # End Sites below any sole
+    assert mend.floor_of(deep, ends=True) == pytest.approx(off, abs=0.03)
+    pos = np.concatenate([deep.pos, deep.ball], axis=1)
+    assert rigs.find_unit(pos)[2] == pytest.approx(clip.hip_height, abs=0.03 if abs(off) > 0.15 else 0.13)
     up = replace(clip, ball=clip.ball + [0, 0, 0.3], pos=clip.pos * [1, 1, 0.1])
     assert mend.floor_of(up) == 0.0 and mend.floor_of(clip) == 0.0
 
@@ -171,7 +202,7 @@ def in_front(path, clip: Clip, frames, style="xsens", away=(3.0, -2.0), seed=0):
     write_rig(path, both, style, seed)
 
 
-@pytest.mark.parametrize("frames, away", [(1, (3.0, -2.0)), (2, (0.0, 40.0)), (5, (-1.0, 0.5))])
+@pytest.mark.parametrize("frames, away", [(1, (3.0, -2.0)), (2, (0.0, 40.0)), (5, (-1.0, 0.5)), (60, (3.0, 0))])
 @pytest.mark.parametrize("rate", (30.0, 120.0))
 def test_leading_rest(tmp_path, capsys, frames, away, rate):
     clip = walk(3.0, rate=rate)
@@ -277,7 +308,8 @@ def test_skeletons_with_suffixes(tmp_path):
     for f in tmp_path.glob("*"):
         f.unlink()
     (tmp_path / "35.asf").write_text(skeleton)
-    for amc, asf in (("09_06-run", "09-run"), ("HDM_bd_01-02_120", "HDM_bd"), ("7_3", "7-walk"), ("AB_1", "ab")):
+    pairs = {"09_06-run": "09-run", "HDM_bd_01-02_120": "HDM_bd", "7_3": "7-walk", "AB_1": "ab", "08_1": "8"}
+    for amc, asf in pairs.items():
         (tmp_path / f"{asf}.asf").write_bytes(b"# K\xfcrzel\n" + skeleton.encode())
         (tmp_path / f"{amc}.amc").write_bytes(b"#!f\xfcr " + amc.encode() + b"\n" + text.encode())
         assert rigs.from_amc(tmp_path / f"{amc}.amc").body.startswith(f"cmu-{asf}-leg")

@@ -173,6 +173,10 @@ def upright(n):
     ("Bip01 L UpperArm", "l", "upperarm"), ("lToeJoint", "l", "toe"), ("lTorso_Clavicle", "l", "torsoclavicle"),
     ("LEFT_FOOT", "l", "foot"), ("leftforearm", "l", "forearm"), ("rfemur", "r", "femur"), ("lleg", "l", "leg"),
     ("leg", "", "leg"), ("radius", "", "radius"), ("lowerback", "", "lowerback"), ("LeftHandIndex1", "l", "handindex"),
+    ("LinksUpLeg", "l", "upleg"), ("Foot_droite", "r", "foot"), ("IzqArm", "l", "arm"), ("RtLeg", "r", "leg"),
+    ("Hand_sx", "l", "hand"), ("uplegleft", "l", "upleg"), ("handr", "r", "hand"), ("lThighBend", "l", "thigh"),
+    ("LFArm", "l", "farm"), ("RUArm", "r", "uarm"), ("Lf_Arm", "l", "arm"), ("arm_upper_L", "l", "upperarm"),
+    ("left_leg_knee_jnt", "l", "knee"), ("LegLower.R", "r", "lowerleg"), ("shoulder", "", "shoulder"),
     ("Character1_LeftArm", "l", "arm"), ("LShldr", "l", "shldr"), ("ns:a:Head", "", "head"), ("R_Wrist", "r", "wrist"),
     ("", "", ""), ("___", "", ""), ("L", "l", ""),
 ])  # fmt: skip
@@ -283,11 +287,12 @@ def test_unknown_rig(tmp_path, capsys):
     write_rig(tmp_path / "odd.bvh", clip, "mixamo", rename={"mixamorig:" + k: v for k, v in ODD.items()})
     with pytest.raises(UserError) as e:
         data.from_bvh(tmp_path / "odd.bvh")
-    for word in ("odd.bvh", "head, shin_l among", "Unterschenkel_links", "mixamorig:Hips", "--joint-map", *RIGS):
+    for word in ("odd.bvh", "no guess for shin_l among", "Unterschenkel_links", "mixamorig:Hips", "--joint-map", *RIGS):
         assert word in str(e.value), word
     blank = capsys.readouterr().out
     assert 'pelvis = "mixamorig:Hips"\n' in blank and 'shin_l = ""  # ?\n' in blank and 'balls = ["Zeh", ' in blank
-    filled = blank.replace('shin_l = ""', 'shin_l = "Unterschenkel_links"').replace('head = ""', 'head = "Schädel"')
+    assert 'head = "Schädel"\n' in blank  # what is behind the neck
+    filled = blank.replace('shin_l = ""', 'shin_l = "Unterschenkel_links"')
     (tmp_path / "map.toml").write_text(filled, encoding="utf-8")
     got = data.from_bvh(tmp_path / "odd.bvh", Reading(str(tmp_path / "map.toml")))
     assert degrees_off(got, clip).max() < 6 and got.body.startswith("map-leg")
@@ -383,17 +388,19 @@ def test_overrides(tmp_path, capsys):
 
 
 def test_units_and_up(tmp_path, capsys):
-    """People of 1.3 to 2.1 m in every unit; a giant is made an adult; one who somersaults needs to be told about."""
+    """People of 1.3 to 2.1 m in every unit, adults in inches; a giant, and who is drawn to taste between two units, are
+    made adults; one who somersaults needs to be told about."""
     for name, unit in rigs.UNITS.items():
-        for height in (1.3, 2.1):
+        for height in (1.55, 2.05) if name in rigs.RARE else (1.3, 2.1):
             clip = augment.resize(walk(1.0), height / 1.75)
             write_rig(tmp_path / "a.bvh", clip, "games105", unit=unit, up="z")
             got = data.from_bvh(tmp_path / "a.bvh")
             np.testing.assert_allclose(got.limb("thigh_l", "shin_l"), clip.limb("thigh_l", "shin_l"), rtol=1e-4)
             assert f"unit {name}: " in capsys.readouterr().err
-    write_rig(tmp_path / "a.bvh", augment.resize(walk(1.0), 3.0), "games105")
-    assert data.from_bvh(tmp_path / "a.bvh").hip_height == pytest.approx(0.9, abs=0.01)
-    assert "units high: scaled to an adult's 0.9 m, " in capsys.readouterr().err
+    for hips in (13.0, 28.0, 45.0, 280.0):
+        write_rig(tmp_path / "a.bvh", walk(1.0), "games105", unit=walk(1.0).hip_height / hips)
+        assert data.from_bvh(tmp_path / "a.bvh").hip_height == pytest.approx(0.9, abs=0.01)
+        assert "units high: scaled to an adult's 0.9 m, " in capsys.readouterr().err
     clip = walk(2.0)
     over = Rotation.from_euler("y", np.linspace(0, 2 * np.pi, len(clip))[:, None])
     pos = np.stack([over.apply(clip.pos[:, s]) for s in range(15)], axis=1)

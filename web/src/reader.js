@@ -22,34 +22,59 @@ const POSITION = ['p', 'pos', 'position', 'loc', 'location', 'translation'];
 const ROTATION = ['q', 'quat', 'quaternion', 'rot', 'rotation', 'ori', 'orient', 'orientation'];
 const MATRIX = ['m', 'mat', 'matrix', 'pose', 'transform'];
 const AXIS = ['x', 'y', 'z', 'w'];
-const WORDS = [...HEAD, ...SIDES, ...HELD, ...POSITION, ...ROTATION, ...AXIS].sort((a, b) => b.length - a.length);
-const TIME = /^(?:delta|elapsed|session|system)?(?:time|timestamp|t)(s|sec|seconds|ms|us|ns|milliseconds)?$/;
+const LOOSE = ['l', 'r', 't', 'local', 'world', 'global', 'knuckles', 'oculus', 'quest', 'vive', 'camera'];
+const [WORDS, LOOSE_WORDS] = [[], LOOSE].map((more) => [...HEAD, ...SIDES, ...HELD, ...POSITION, ...ROTATION, ...AXIS, ...more]
+  .sort((a, b) => b.length - a.length));
+const TIME = /^(?:delta|elapsed|session|system|unix|epoch|utc)?(?:time|timestamp|t)(s|sec|seconds|ms|us|ns|milliseconds)?$/;
+const LENGTH = /[[(](?:(?:c|m)?m|(?:centi|milli)?met(?:re|er)s?)[\])]|[_ ](?:(?:c|m)?m|(?:centi|milli)?met(?:re|er)s?)$/gi;
 const SECONDS = { ms: 1e-3, milliseconds: 1e-3, us: 1e-6, ns: 1e-9 };
 const lettersOf = (text) => text.toLowerCase().replace(/[^a-z]/g, '');
 
-export function column(name) { // reader.column: the canonical name of a column, or null
+export function column(name, loose = false) { // reader.column: the canonical name of a column, or null
   if (TIME.test(lettersOf(name))) return 'time';
-  const text = name.trim().replace(/^"+|"+$/g, '').replace(/[[(](?:c|m)?m[\])]|[_ ](?:c|m)?m$/g, ''); // a length's unit
+  const text = name.trim().replace(/^"+|"+$/g, '').replace(LENGTH, '');
   const letters = lettersOf(text);
   const digits = text.match(/\d/g);
   if (digits) return matrixColumn(letters, digits);
-  const words = wordsOf(letters);
+  const words = wordsOf(letters, loose);
   const device = deviceOf(words);
   const axis = words.filter((w) => AXIS.includes(w));
-  const [turns, moves] = [ROTATION, POSITION].map((kind) => words.some((w) => kind.includes(w)));
+  const [turns, moves] = [ROTATION, [...POSITION, 't']].map((kind) => words.some((w) => kind.includes(w)));
   if (!device || axis.length !== 1 || (turns && moves) || (axis[0] === 'w' && !turns)) return null;
   return `${device}_${turns ? 'q' : 'p'}${axis[0]}`;
 }
 
-function wordsOf(letters) { // reader._words: the words that make up the letters, or none
-  const found = letters.length < 80 ? letters.match(new RegExp(WORDS.join('|'), 'g')) ?? [] : [];
+function wordsOf(letters, loose) { // reader._words: the words that make up the letters, or none
+  const words = loose ? LOOSE_WORDS : WORDS;
+  const found = letters.length < 80 ? letters.match(new RegExp(words.join('|'), 'g')) ?? [] : [];
   return found.join('') === letters ? found : [];
 }
 
 function deviceOf(words) { // reader._device
-  const devices = new Set(words.filter((w) => SIDES.includes(w)));
-  if (words.some((w) => HEAD.includes(w))) devices.add('head');
+  const devices = new Set(words.flatMap((w) => SIDES.filter((s) => w === s || w === s[0])));
+  if (words.some((w) => HEAD.includes(w) || w === 'camera')) devices.add('head');
   return devices.size === 1 ? [...devices][0] : null;
+}
+
+export function columns(names, wanted) { // reader.columns: as they stand, loosely, or without what all begin with
+  const ways = [names.map((n) => column(n)), names.map((n) => column(n, true)),
+    withoutPrefix(names).map((n) => column(n, true))];
+  const twice = (way) => way.some((c, i) => c && c !== 'time' && way.indexOf(c) !== i);
+  return ways.find((way) => wanted.every((c) => told(way).has(c)) && !twice(way)) ?? ways[0];
+}
+
+function told(known) { // reader.told: the columns that are there, those of a matrix among them
+  const whole = DEVICES.filter((d) => [0, 1, 2].every((i) => [0, 1, 2, 3].every((j) => known.includes(`${d}_m${i}${j}`))));
+  return new Set([...known, ...whole.flatMap((d) => PARTS.map((p) => `${d}_${p}`))]);
+}
+
+function withoutPrefix(names) { // mocap.guess.without_prefix
+  if (names.length < 5) return names;
+  const middle = [...names].sort()[Math.floor(names.length / 2)].slice(0, 100);
+  const shared = (k) => names.filter((n) => n.startsWith(middle.slice(0, k))).length >= 0.8 * names.length;
+  let best = 0;
+  while (best < middle.length && shared(best + 1)) best += 1;
+  return names.map((n) => (n.startsWith(middle.slice(0, best)) && n.length > best ? n.slice(best) : n));
 }
 
 function matrixColumn(letters, digits) { // reader._matrix_column: "hmd_m03" -> head_m03
@@ -172,10 +197,10 @@ export class Reader { // reader.Reader, of files: a line that cannot be read is 
 
   header(line) { // reader.Reader.header: where which column is
     this.names = line.split(',').map((c) => c.trim());
-    const known = this.names.map(column);
+    const known = columns(this.names, this.wanted.slice(1));
     const ours = (mark) => line.split(mark).filter((c) => column(c)).length;
     const mark = Object.keys(SEPARATORS).reduce((a, b) => (ours(b) > ours(a) ? b : a));
-    if (ours(mark) > Math.max(ours(','), 1)) {
+    if (ours(mark) > Math.max(known.filter((c) => c).length, 1)) {
       const valid = 'commas, and points in the numbers';
       this.fail(`, line ${this.line}: ${SEPARATORS[mark]} between the columns; valid: ${valid}`);
     }
@@ -183,8 +208,7 @@ export class Reader { // reader.Reader, of files: a line that cannot be read is 
     const entries = used.map((d) => [0, 1, 2].flatMap((i) => [0, 1, 2, 3].map((j) => `${d}_m${i}${j}`)));
     this.matrices = entries.map((names, k) => [k, names.map((c) => known.indexOf(c))])
       .filter(([, at]) => at.every((i) => i >= 0));
-    const told = new Set(this.matrices.flatMap(([k]) => PARTS.map((p) => `${DEVICES[k]}_${p}`)));
-    const missing = this.wanted.slice(1).filter((c) => !known.includes(c) && !told.has(c));
+    const missing = this.wanted.slice(1).filter((c) => !told(known).has(c));
     const twice = known.find((c, i) => c && c !== 'time' && known.indexOf(c) !== i);
     if (twice) this.fail(`, line ${this.line}: column ${twice} is there twice; valid: once each`);
     if (missing.length) {
