@@ -20,6 +20,7 @@ simulated twice, and the policy is the same to the bit.
 from __future__ import annotations
 
 import os
+import socket
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -47,6 +48,7 @@ except ImportError:  # without the extra `cluster`: main says so
 SENT = ("x", "action", "mu", "logp", "reward", "old_value", "next_value", "terminated", "truncated")  # (T, n, …)
 MADE_OF = ("char", "ref", "horizon", "substeps", "asymmetric", "starts", "root_limit", "disturbance")  # an Env
 LINES = "workers.csv"  # of the run folder: a line a worker and update
+PATIENCE = 10.0  # s for a cluster's head to answer
 TRIES = 5  # a rollout whose worker is lost so often is given up
 OURS = ("RAY_USAGE_STATS_ENABLED", "RAY_worker_niceness")  # 0: nothing is sent out; workers as important as the driver
 ONE_THREAD = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")}  # of a worker's BLAS
@@ -347,9 +349,12 @@ def connected(opt: Options):
         os.environ.setdefault(name, "0")
     how = {"address": "local", "num_cpus": need, "include_dashboard": False}
     how = {"address": opt.address} if opt.address else how
+    host, colon, port = (opt.address or "").rpartition(":")
     try:
+        if colon:  # Ray itself would wait for it for ever
+            socket.create_connection((host, int(port)), PATIENCE).close()
         ray.init(**how, runtime_env={"env_vars": ONE_THREAD}, logging_level="error", log_to_driver=False)
-    except (ConnectionError, ValueError) as e:
+    except (OSError, ValueError) as e:
         start = "ray start --head --port 6379"
         raise UserError(f"--address {opt.address}: no Ray cluster there ({e}); this starts one: {start}") from None
     try:
