@@ -143,6 +143,8 @@ class Workers:
     Test      tests/extras/test_cluster.py::test_resume_is_exact, test_killed_worker, test_removed_node
     """
 
+    kind = Worker
+
     def __init__(self, env: Env, opt: Options):
         if opt.envs % opt.workers:
             raise UserError(f"--envs {opt.envs} of {opt.workers} workers: not the same number each; valid: a multiple")
@@ -168,7 +170,7 @@ class Workers:
         """A new process for worker k, on a machine with so many cores free."""
         if self.actors[k]:
             ray.kill(self.actors[k])  # it may live on behind a broken line
-        self.actors[k] = ray.remote(Worker).options(num_cpus=cores, max_restarts=0).remote(self.opt, self.parts)
+        self.actors[k] = ray.remote(self.kind).options(num_cpus=cores, max_restarts=0).remote(self.opt, self.parts)
 
     def free(self) -> int:
         """Cores that no worker holds."""
