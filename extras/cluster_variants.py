@@ -10,6 +10,8 @@ stale       as samples, but the next rollout begins before the update: by weight
 
 from __future__ import annotations
 
+import os
+import time
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
@@ -30,6 +32,9 @@ class Options(cluster.Options):
     """extras/cluster.py's options, and the scheme."""
 
     scheme: str = arg("samples", "who learns from what", ("samples", "gradients", "stale"))
+    speed: bool = arg(False, "time all schemes in turn, an update each, beside ppo.py --threads 2")
+    rounds: int = arg(10, "with --speed: how often")
+    toy: bool = arg(False, "learning curves on a small task (PYTHONPATH=tests), 10 seeds")
     here: bool = arg(False, "all workers in this process, one after the other: for learning curves")
 
 
@@ -168,9 +173,90 @@ def made(opt, env, engine):
     return trainer(opt, workers)
 
 
+class Point(Worker):
+    """A worker whose characters are points on a line."""
+
+    def __init__(self, opt, parts):
+        self.trainer = ppo.Trainer(opt, parts["reach"](opt.envs))
+
+    def reset(self, seed):
+        self.trainer.env.reset(seed)
+        self.trainer.env.state = lambda: None
+        return {"full": self.trainer.env.full.copy(), "state": None}
+
+
+class LearningPoint(Learner):
+    """The same, which gives gradients."""
+
+    __init__, reset = Point.__init__, Point.reset
+
+
+def toy(opt, updates=40, seeds=10):
+    """Mean reward of the last five of 40 updates, and of the first twenty, over seeds; 4 workers of 16 points."""
+    from test_ppo import Reach
+
+    small = dict(envs=64, horizon=12, minibatch=256, hidden=(16,), value_hidden=(16,), out="/tmp/reach")
+    opt = replace(opt, **small, sigma=0.5, gamma=0.9, lr=1e-3, value_lr=3e-3, steps=10**9)
+    kinds = {"samples": (Point, cluster.Trainer), "gradients": (LearningPoint, Averager), "stale": (Point, Overlapped)}
+    cluster.made_of = lambda env: {"reach": Reach}
+    cluster.Trainer.tell = lambda *_: None
+    for name in ("ppo.py", *kinds):
+        last, early, kls, reached = [], [], [], []
+        for seed in range(seeds):
+            one = replace(opt, seed=seed, minibatch=64 if name == "gradients" else 256)
+            if name == "ppo.py":
+                trainer = ppo.Trainer(one, Reach(64))
+            else:
+                env = Reach(64)
+                env.ref = None
+                workers = type("Engine", (Local,), {"kind": kinds[name][0]})(env, one)
+                trainer = kinds[name][1](replace(one, minibatch=256), workers)
+            trainer.start()
+            rows = [trainer.collect() | trainer.update() for _ in range(updates)]
+            last.append(fmean(r["reward"] for r in rows[-5:]))
+            early.append(fmean(r["reward"] for r in rows[:20]))
+            reached.append(next((k + 1 for k, r in enumerate(rows) if r["reward"] > 0.7), updates))
+            kls.append(fmean(r["kl"] for r in rows))
+        error = np.std(early) / np.sqrt(seeds)
+        print(f"{name}: first 20 {fmean(early):.3f} ± {error:.3f}, last 5 {fmean(last):.3f} ± "
+              f"{np.std(last) / np.sqrt(seeds):.3f}, kl {fmean(kls):.4f}, "
+              f"0.7 after {fmean(reached):.1f} ± {np.std(reached) / np.sqrt(seeds):.1f} updates")  # fmt: skip
+
+
+def speed(opt, env):
+    """Steps a second of every scheme, in turn; ratios are medians of the rounds'."""
+    from extras.cluster_bench import below, processor
+
+    loops = {"ppo.py --threads 2": ppo.Trainer(replace(opt, threads=2), train.make_env(replace(opt, threads=2)))}
+    loops |= {scheme: made(replace(opt, scheme=scheme), env, Workers) for scheme in SCHEMES}
+    for trainer in loops.values():
+        trainer.start()
+    times, used = {name: [] for name in loops}, {name: [] for name in loops}
+    for k in range(opt.rounds + 1):
+        for name in list(loops)[k % 4 :] + list(loops)[: k % 4]:
+            pids = [os.getpid(), *below(os.getpid())]
+            cpu, began = processor(pids), time.perf_counter()
+            loops[name].collect(), loops[name].update()
+            if name == "stale":  # nothing runs on beside another loop
+                cluster.ray.wait([a for a, _ in loops[name].pending[0]], num_returns=opt.workers)
+            times[name].append(time.perf_counter() - began)
+            used[name].append(processor(pids) - cpu)
+    base = np.array(times["samples"][1:])
+    for name, each in times.items():
+        wall = np.array(each[1:])
+        print(f"{name}: {opt.envs * opt.horizon / np.median(wall):.0f} steps/s, {np.median(base / wall):.2f}, "
+              f"{1e6 * np.median(used[name][1:]) / opt.envs / opt.horizon:.0f} µs of processor a step")  # fmt: skip
+
+
 def main(argv=None):
     opt = read_options(Options, argv, "extras.cluster_variants", __doc__, widths)
+    if opt.toy:
+        return toy(opt)
     env = train.make_env(replace(opt, envs=1, threads=1))
+    if opt.speed:
+        os.makedirs(opt.out)
+        with cluster.connected(replace(opt, workers=3 * opt.workers)):
+            return speed(opt, env)
     if opt.here:
         return ppo.run(made(opt, env, Local))
     with cluster.connected(opt):
