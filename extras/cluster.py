@@ -143,8 +143,6 @@ class Workers:
     Test      tests/extras/test_cluster.py::test_resume_is_exact, test_killed_worker, test_removed_node
     """
 
-    kind = Worker
-
     def __init__(self, env: Env, opt: Options):
         if opt.envs % opt.workers:
             raise UserError(f"--envs {opt.envs} of {opt.workers} workers: not the same number each; valid: a multiple")
@@ -170,7 +168,7 @@ class Workers:
         """A new process for worker k, on a machine with so many cores free."""
         if self.actors[k]:
             ray.kill(self.actors[k])  # it may live on behind a broken line
-        self.actors[k] = ray.remote(self.kind).options(num_cpus=cores, max_restarts=0).remote(self.opt, self.parts)
+        self.actors[k] = ray.remote(Worker).options(num_cpus=cores, max_restarts=0).remote(self.opt, self.parts)
 
     def free(self) -> int:
         """Cores that no worker holds."""
@@ -336,6 +334,11 @@ class Trainer(ppo.Trainer):
             row = {"update": self.updates + 1, "worker": k, "steps_per_s": steps / f["seconds"]}
             self.lines.append(row | {"collect_s": f["seconds"], "all_s": seconds, "begun_again": self.env.begun[k]})
 
+    def close(self):
+        """No more lines."""
+        if self.lines:
+            self.lines.close()
+
 
 # ------------------------------------------------------------------------------------ command line
 
@@ -380,7 +383,8 @@ def main(argv=None):
         raise UserError("--gpu: the workers' physics runs on processors; leave it out, or use extras.train")
     env = train.make_env(replace(opt, envs=1, threads=1))
     with connected(opt):
-        ppo.train(opt, Workers(env, opt), trainer=Trainer)
+        trainer = ppo.train(opt, Workers(env, opt), trainer=Trainer)
+        trainer.close()
 
 
 if __name__ == "__main__":

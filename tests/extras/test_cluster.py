@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from test_ppo import ROOT, TINY, assert_same_run
 
+import ppo
 from extras import cluster, train
 from extras.cluster import LINES, Lost, Worker, Workers
 from nn import RunningNorm
@@ -24,7 +25,8 @@ from plumbing import runs
 from plumbing.cli import UserError
 from plumbing.runs import CHECKPOINT, METRICS, load_checkpoint, read_metrics
 
-CURRICULUM = "--balance --retry 0.3 --stand 0.2 --sensor-noise 0.01 --sensor-offset 0.01 --push 0.4 --episode 20 --sigma 0.4".split()
+CURRICULUM = "--balance --retry 0.3 --stand 0.2 --sensor-noise 0.01 --sensor-offset 0.01 --push 0.4".split()
+CURRICULUM += "--episode 20 --sigma 0.4".split()
 
 
 class Here(Workers):
@@ -66,7 +68,7 @@ class Here(Workers):
         return self.found[k] if k in self.found else self.do(asked)
 
 
-def here(out, updates, *more, **changes):
+def here(out, updates, *more, main=cluster.main, **changes):
     """The command line with the workers in this process, to `updates` updates in all."""
     args = list(more) if "--resume" in more else [*TINY, *CURRICULUM, *more]
 
@@ -80,7 +82,7 @@ def here(out, updates, *more, **changes):
         patch.setattr(cluster, "Workers", make)
         patch.setattr(cluster, "connected", nullcontext)
         patch.setattr(cluster, "ray", cluster)
-        cluster.main([*args, "--out", str(out), "--steps", str(64 * updates)])
+        main([*args, "--out", str(out), "--steps", str(64 * updates)])
     return load_checkpoint(Path(out) / CHECKPOINT)
 
 
@@ -128,8 +130,9 @@ def test_workers_differ(whole):
 
 
 def test_resume_is_exact(whole, tmp_path):
-    here(tmp_path / "a", 3, "--workers", "2")
-    _, meta = here(tmp_path / "a", 6, "--resume")
+    here(tmp_path / "a", 2, "--workers", "2")
+    here(tmp_path / "a", 4, "--resume", "--address", "auto")  # another cluster
+    _, meta = here(tmp_path / "a", 6, "--resume", main=ppo.main)  # which hands on
     assert meta["updates"] == 6 and meta["steps"] == 6 * 64
     assert_same_run(whole, tmp_path / "a")
     ours, theirs = (read_metrics(d / LINES) for d in (whole, tmp_path / "a"))
