@@ -153,7 +153,6 @@ class Workers:
         self.rngs = [np.random.default_rng([opt.seed, 1, k]) for k in range(1, opt.workers)]
         self.states, self.begun = [None] * opt.workers, [0] * opt.workers
         self.actors = [None] * opt.workers
-        self.loaded = [True] * opt.workers  # does it hold the state of its last answer?
         self.parts = self.share(made_of(env))
         for k in range(opt.workers):
             self.begin(k, opt.threads)
@@ -209,8 +208,8 @@ class Workers:
                 beside = "" if cores else ", beside others, for no core is free"
                 print(f"note: worker {k} is lost ({lost}); it begins its rollout again{beside}", flush=True)
                 self.begin(k, cores)
-                again = (*args[:2], self.states[k]) if name == "collect" else args
-                asked = self.ask(k, name, *again)
+                more = (self.states[k],) if name == "collect" else ()  # where to begin
+                asked = self.ask(k, name, *args, *more)
         goes_on = f"python -m extras.cluster --resume --out {self.opt.out}"
         raise UserError(f"worker {k} was lost {TRIES} times in one {name}; from the last checkpoint: {goes_on}")
 
@@ -223,9 +222,9 @@ class Workers:
     def collect(self, weights, rngs) -> list:
         """A rollout of every worker.  Args: weights : `Policy.arrays`; rngs : of each"""
         shared = self.share(weights)
-        states = [None if ok else s for ok, s in zip(self.loaded, self.states)]
-        found = self.gather("collect", [(shared, *each) for each in zip(rngs, states)])
-        self.states, self.loaded = [f["state"] for f in found], [True] * self.workers
+        found = self.gather("collect", [(shared, rng) for rng in rngs])
+        # copies, or each would hold its whole rollout in Ray's memory
+        self.states = [({k: a.copy() for k, a in arrays.items()}, m) for arrays, m in (f["state"] for f in found)]
         return found
 
     def state(self) -> tuple[dict, dict]:
@@ -308,19 +307,17 @@ class Trainer(ppo.Trainer):
         self.rng, *self.env.rngs = (f["rng"] for f in found)
         for name in SENT:
             np.concatenate([f["samples"][name] for f in found], axis=1, out=getattr(self, name))
-        self.seen = [f["seen"] for f in found]
+        for f in found:  # for the next samples; these are normalised already
+            merge(self.policy.norm, f["seen"])
         self.steps += self.reward.size
         self.tell(found, time.perf_counter() - asked)
         return merged([f["stats"] for f in found], self.reward.size * self.env.dt)
 
     def update(self) -> dict:
-        """As `ppo.Trainer.update`; the normaliser learns from the workers' moments."""
-        norm = self.policy.norm
-        norm.frozen = True  # there are no raw observations here
+        """As `ppo.Trainer.update`; the normaliser has learnt already, from the workers' moments."""
+        self.policy.norm.frozen = True
         stats = super().update()
-        norm.frozen = False
-        for seen in self.seen:
-            merge(norm, seen)
+        self.policy.norm.frozen = False
         return stats
 
     def tell(self, found, seconds):
