@@ -17,7 +17,7 @@ import numpy as np
 from plumbing.cli import UserError, cli, given_flags
 from plumbing.runs import CONFIG, check_run, read_config, stored_options
 
-CHANGEABLE = ("steps", "threads", "resume", "out")  # what may differ when a run is resumed
+CHANGEABLE = ("steps", "threads", "resume", "out", "address")  # what may differ when a run is resumed
 
 
 def read_options(kind, argv, prog, description, widths=None):
