@@ -2,6 +2,7 @@
 
 import functools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from mocap import data
 from plumbing import render
 from plumbing.cli import UserError
 from plumbing.runs import save_checkpoint
-from policy import Policy, load_policy
+from policy import Policy, load_policy, trained_as
 
 COLUMNS = [key for key, *_ in metrics.COLUMNS]
 
@@ -434,6 +435,58 @@ def test_comparison_sheet(two, tmp_path, monkeypatch):
     monkeypatch.setattr(retarget, "draw", blank), monkeypatch.setattr(play, "pictures", blank)
     coarse = play.comparison_sheet(arms, clips[0], play.Options(threads=1, every=0.5, seconds=1.0), size=(96, 80))
     assert coarse.shape[1] == 3 * 96
+
+
+@pytest.fixture
+def figure(two, monkeypatch):
+    """Figure 6 is two untrained policies, on a second and a half of a walk."""
+    clip = data.load("builtin")[0]
+    monkeypatch.setattr(play, "CHARACTERS", two[0].parent)
+    monkeypatch.setitem(play.FIGURES, 6, tuple(p.stem for p in two))
+    monkeypatch.setattr(metrics, "motion_of", lambda opt: ([clip], [clip]))
+    return clip
+
+
+def test_figure(two, figure, tmp_path, monkeypatch, capsys):
+    """The numbers are `metrics.streamed`'s; the sheet has a band of them under every policy; so has the video."""
+    if render.gl_backend() is None:
+        pytest.skip("no OpenGL")
+    plain = play.comparison_sheet
+    monkeypatch.setattr(play, "comparison_sheet", lambda *a, **k: plain(*a, size=(300, 80), **k))
+    assert play.main(["--figure", "6", "--png", str(tmp_path / "f.png"), "--seconds", "1", "--threads", "1"]) == 0
+    [arm, _] = metrics.arms_of([figure], play.Options(compare=tuple(map(str, two)), threads=1))
+    row = metrics.streamed(arm.char, arm.policy.mean_action, [figure], arm.devices, 1)
+    said = capsys.readouterr().out
+    assert f"| root cm | {row['root_cm']:.1f} |" in said and "| joints cm |" not in said
+    options = play.Options(figure=6, compare=tuple(map(str, two)), rows=("streamed",), threads=1, seconds=1.0)
+    arms = metrics.arms_of([figure], options)
+    numbers = {a.path: "one 1  two 2" for a in arms}
+    with_numbers, without = plain(arms, figure, options, numbers=numbers), plain(arms, figure, options)
+    assert len(with_numbers) - len(without) == 2 * 20 and with_numbers.shape[1] == without.shape[1]
+    np.testing.assert_array_equal(with_numbers[-20:], play.lines_of("one 1  two 2", without.shape[1])[0])
+    images = list(play.film(arms, figure, options, numbers, size=(96, 80)))
+    height = 80 + 20 * len(play.lines_of("one 1  two 2", 96))
+    assert len(images) == 31 and {i.shape for i in images} == {(height, 2 * 96, 3)}
+    bands = play.lines_of("one 1  two 2  " + "x" * 99, 160)
+    assert len(bands) == 2 and {b.shape for b in bands} == {(20, 160, 3)}
+
+
+def test_figure_options(figure, tmp_path, monkeypatch):
+    """One walk of one user unless another is asked for; a picture unless a video is; no flags of other plays."""
+    of = lambda *argv: play.figure_options(play.cli(play.Options, ["--figure", "6", *argv], "t", ""), argv)  # noqa: E731
+    opt = of()
+    assert (opt.clips, opt.png, opt.rows) == (play.USER, "figure-6.png", ("streamed",))
+    assert [Path(p).stem for p in opt.compare] == list(play.FIGURES[6])
+    assert of("--motion", "x").clips == "*" and of("--clips", "turn_115").clips == "turn_115"
+    assert of("--video", "v.mp4").png is None
+    for wrong in (["--policy", "x"], ["--rows", "tracked"], ["--bvh", "x"], ["--sensors", "hmd"]):
+        with pytest.raises(UserError, match=f"--figure 6: has its own policies, streamed: leave out {wrong[0]}"):
+            of(*wrong)
+    monkeypatch.setitem(play.FIGURES, 6, ("dino", "dino-gone"))
+    monkeypatch.setattr(play, "CHARACTERS", tmp_path)
+    (tmp_path / "dino.npz").touch()
+    with pytest.raises(UserError, match="no policy .*dino-gone.npz; train one: python -m extras.arms run dino-gone"):
+        of()
 
 
 def test_told_life():
