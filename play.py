@@ -138,12 +138,12 @@ def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320), numbe
     wide.type, wide.trackbodyid, wide.distance = mujoco.mjtCamera.mjCAMERA_TRACKING, arms[0].char.root, 3.5
     wide.azimuth, wide.elevation = 205, -8
     human = retarget.draw(arms[0].char, clip, pose, frames, size, wide, beside)
-    rows = [(f"human and kinematic {name_of(arms[0].char)}: {clip.name}", human, times)]
+    rows, view = [(f"human and kinematic {name_of(arms[0].char)}: {clip.name}", human, times)], same_view(arms)
     for a in arms:
         recording, seen = played(a, clip, opt)
         lived = [t for t in frames if t < len(recording.frames)]
         gone = len(frames) - len(lived)
-        images = pictures(a.char, seen, recording, lived, size)
+        images = pictures(a.char, seen, recording, lived, size, camera=view)
         images += [np.full_like(images[0], 255)] * gone
         end = f"failed at {(len(recording.frames) - 1) / rate:.1f} s"
         rows.append((a.title(), images, times[: len(lived)] + [end] * gone))
@@ -183,10 +183,25 @@ def played(arm: Arm, clip, opt: Options):
     return SimpleNamespace(qpos=r.qpos[:lived], frames=np.arange(lived)), seen
 
 
-def pictures(char: Character, ref: Reference, recording: Recording, frames, size=(480, 360), fast=False):
+def same_view(arms: list[Arm]):
+    """One camera for bodies of several sizes, or None: each body has its own, by which all would look alike.
+
+    Test      tests/test_play.py::test_same_view"""
+    hips = {a.char.name: set() for a in arms}
+    for a in arms:
+        hips[a.char.name].add(a.char.hip_height)
+    if all(len(h) == 1 for h in hips.values()):
+        return None
+    view = mujoco.MjvCamera()
+    view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, arms[0].char.root
+    view.distance, view.azimuth, view.elevation = 7.0 * max(max(h) for h in hips.values()), 205, -8
+    return view
+
+
+def pictures(char: Character, ref: Reference, recording: Recording, frames, size=(480, 360), fast=False, camera=None):
     """Images (H, W, 3) of the character with the three sensor poses it was given.
 
-    Args      frames : indices into the recording
+    Args      frames : indices into the recording; camera : as `render.Scene.frame` has it
     Test      tests/robustness/test_cli.py::test_play_png
     """
     from plumbing import render
@@ -199,7 +214,7 @@ def pictures(char: Character, ref: Reference, recording: Recording, frames, size
         data.qpos[:] = recording.qpos[t]
         mujoco.mj_forward(shown, data)
         f = recording.frames[t]
-        images.append(scene.frame(data, markers=render.device_markers(ref.sensor_pos[f], ref.sensor_quat[f])))
+        images.append(scene.frame(data, camera, render.device_markers(ref.sensor_pos[f], ref.sensor_quat[f])))
     return images
 
 
@@ -370,7 +385,7 @@ def film(arms: list[Arm], clip, opt: Options, numbers, size=(480, 480)):
     for a in arms:
         recording, seen = played(a, clip, opt)
         lived = range(min(last + 1, len(recording.frames)))
-        films.append(pictures(a.char, seen, recording, lived, size, fast=True))
+        films.append(pictures(a.char, seen, recording, lived, size, True, same_view(arms)))
     under = [np.vstack(lines_of(numbers[a.path], size[0])) for a in arms]
     for t in range(last + 1):
         shown = [f[t] if t < len(f) else np.full_like(f[0], 255) for f in films]

@@ -3,6 +3,7 @@
 import functools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -431,7 +432,7 @@ def test_comparison_sheet(two, tmp_path, monkeypatch):
     times = np.unique(np.arange(0, 45, 44 / 7).round().astype(int))
     np.testing.assert_array_equal(white, [[False] * 8, white[1], [t >= len(lived.frames) for t in times]])
     assert not white[:, 0].any() and white[2, -1]
-    blank = lambda *a: [np.zeros((80, 96, 3), np.uint8)] * len(a[3])  # noqa: E731, drawing is slow
+    blank = lambda *a, **_: [np.zeros((80, 96, 3), np.uint8)] * len(a[3])  # noqa: E731, drawing is slow
     monkeypatch.setattr(retarget, "draw", blank), monkeypatch.setattr(play, "pictures", blank)
     coarse = play.comparison_sheet(arms, clips[0], play.Options(threads=1, every=0.5, seconds=1.0), size=(96, 80))
     assert coarse.shape[1] == 3 * 96
@@ -471,6 +472,14 @@ def test_figure(two, figure, tmp_path, monkeypatch, capsys):
     assert len(bands) == 2 and {b.shape for b in bands} == {(20, 160, 3)}
 
 
+def test_same_view():
+    """Bodies of one size, or two characters, keep their own cameras; two sizes of one are seen from one distance."""
+    arm = lambda name, scale=1.0: SimpleNamespace(char=character.load(name, scale=scale))  # noqa: E731
+    assert play.same_view([arm("oppy"), arm("oppy")]) is None and play.same_view([arm("oppy"), arm("jesse")]) is None
+    view = play.same_view([small := arm("oppy", 0.9), tall := arm("oppy", 1.15)])
+    assert view.distance == pytest.approx(7 * tall.char.hip_height) and view.trackbodyid == small.char.root
+
+
 def test_figure_options(figure, tmp_path, monkeypatch):
     """One walk of one user unless another is asked for; a picture unless a video is; no flags of other plays."""
     of = lambda *argv: play.figure_options(play.cli(play.Options, ["--figure", "6", *argv], "t", ""), argv)  # noqa: E731
@@ -487,6 +496,25 @@ def test_figure_options(figure, tmp_path, monkeypatch):
     (tmp_path / "dino.npz").touch()
     with pytest.raises(UserError, match="no policy .*dino-gone.npz; train one: python -m extras.arms run dino-gone"):
         of()
+
+
+def test_shipped_figures():
+    """What is shipped of a figure is small, and of the body or reward that it is about; Figs. 5 and 8 are whole."""
+    told = {"small": "scale", "tall": "scale", "passive": "tail", "fixed": "tail", "orientation": None}
+    there = {n for names in play.FIGURES.values() for n in names if (character.CHARACTERS / f"{n}.npz").is_file()}
+    assert there >= {*play.FIGURES[5], *play.FIGURES[8]}
+    for name in there:
+        path = character.CHARACTERS / f"{name}.npz"
+        _, meta = load_policy(path)
+        own, (_, _, kind) = trained_as(meta, path), name.partition("-")
+        assert list(own.load().variant) == ([told[kind]] if kind and told[kind] else []), name
+        assert ("orientation" in meta["options"]["without"]) == (kind == "orientation")
+        if kind:
+            assert path.stat().st_size < 1.5e6
+        if told.get(kind) == "scale":
+            assert (own.scale < 1) == (kind == "small")
+        elif told.get(kind) == "tail":
+            assert own.tail == kind
 
 
 def test_told_life():
