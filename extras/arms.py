@@ -17,6 +17,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
+from collections import Counter
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -128,7 +129,7 @@ COLUMNS = tuple(
     if c[0] == key
 )
 CURVES = ("time_to_failure", "survival", "length")  # of metrics.csv: rewards differ between arms by what they leave out
-MARKS = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)  # million steps at which the curves are printed
+MARKS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)  # million steps at which the curves are printed
 
 
 @dataclass
@@ -266,12 +267,15 @@ class Measuring:
 
 
 def claim_rows(claim: Claim, of, measuring: Measuring) -> dict:
-    """Row name -> numbers of one claim on one set: arms, then each character's baselines; {} where no arm was run.
+    """Row name -> numbers of one claim on one set: arms, then each character's baselines.
+
+    {} where fewer than two arms of one character were run: there is nothing to compare.
 
     Test      tests/extras/test_arms.py::test_table"""
-    rows = {name: measuring.arm(name, of) for name in claim.arms}
-    if not any(rows.values()):
+    there = [n for n in claim.arms if (folder_of(n, measuring.opt) / runs.CHECKPOINT).is_file()]
+    if not there or max(Counter(ARMS[n].character for n in there).values()) < 2:
         return {}
+    rows = {name: measuring.arm(name, of) for name in claim.arms}
     for character in dict.fromkeys(ARMS[name].character for name, row in rows.items() if row):
         rows |= measuring.baselines(character, of)
     return rows
@@ -290,7 +294,7 @@ def unequal(rows: dict) -> list[str]:
 
 
 def table(opt: Options) -> dict:
-    """Print a table for every claim and set of which an arm was run.  -> claim -> set -> row -> numbers
+    """Print a table for every claim and set of which two arms were run.  -> claim -> set -> row -> numbers
 
     Test      tests/extras/test_arms.py::test_table"""
     measuring, out = Measuring(opt), {}
@@ -308,7 +312,7 @@ def table(opt: Options) -> dict:
             print(*unequal(rows), sep="\n", end="\n" if unequal(rows) else "", flush=True)
             out.setdefault(claim.title, {})[of] = {k: v for k, v in rows.items() if v}
     if not out:
-        raise UserError(f"{opt.out}: no arm of seed {opt.seed} was run; valid: python -m extras.arms run NAME")
+        raise UserError(f"{opt.out}: no two arms of a claim and seed {opt.seed} were run; valid: extras.arms run A B")
     return out
 
 
