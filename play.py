@@ -9,6 +9,7 @@ r"""Watch one policy: picture, video, viewer, BVH; on a motion or a headset's re
     python play.py --character jesse --motion FOLDER --measure [--json OUT]     every metric (metrics.py)
     python play.py --character jesse --motion FOLDER --measure --push 400@2     the largest push survived
     python play.py --compare A B … --motion FOLDER [--json OUT] [--png OUT]     policies beside one another
+    python play.py --figure 5 [--png OUT] [--video OUT]                         a figure of the paper, to be watched
 
 Rows of the table: `streamed` (its mean action, driven by sensors alone, from the default pose), `tracked` (begun on the
 user's true pose), `kinematic` (the retargeted pose itself), `zero` (no torque) and `pd` (open-loop PD tracking of the
@@ -21,8 +22,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -32,7 +34,7 @@ import numpy as np
 import metrics
 import mocap.data
 import retarget
-from character import Character
+from character import CHARACTERS, Character
 from env import EPISODE_STEPS, ROOT_LIMIT, Env
 from headset import axes, calibration
 from headset.bsor import opened
@@ -52,6 +54,13 @@ from retarget import Reference, forward_kinematics
 OF_MOTION = {"motion", "clips", "joint_map", "unit", "up", "all", "split", "half", "rows", "user_scale"}
 OF_MOTION |= {"random_starts", "sequence", "rate", "floor", "rest_pose"}
 OF_STREAM = {"axes", "grip", "stream_unit", "devices", "sample_rate", "user_height", "realtime"}
+
+FIGURES = {  # of the paper: the policies in characters/ that it puts side by side
+    5: ("oppy-small", "oppy", "oppy-tall"),  # sizes
+    6: ("dino", "dino-orientation"),  # with the orientation reward, and without it
+    8: ("dino", "dino-passive", "dino-fixed"),  # the tail: two joints driven, none driven, six welded
+}
+OF_FIGURE = "completed root_cm head_deg head_wobble_deg_s contact_agreement foot_slide_cm_s steps_per_m".split()
 
 
 @dataclass
@@ -96,6 +105,9 @@ class Options(retarget.BvhFlags, StreamFlags, metrics.Options):
     )
     port: int = arg(0, "port of the browser viewer, 0 = the first free one from 8080", check=NONNEGATIVE)
     realtime: bool = arg(False, "play a stream at the wall clock's pace and report the deadlines missed")
+    figure: int | None = arg(
+        None, "a figure of the paper: its policies, streamed, on one user; by default figure-N.png", tuple(FIGURES)
+    )
 
 
 # ------------------------------------------------------------------------------------ looking
@@ -103,11 +115,12 @@ class Options(retarget.BvhFlags, StreamFlags, metrics.Options):
 PICTURES = 8  # a row of the figure, unless --every says otherwise
 
 
-def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320)):
+def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320), numbers=None):
     """One picture: the human beside the first character's kinematic pose, then a row for every policy.
 
     All at the same moments of one sequence; where a policy had failed its row is empty.  The camera follows.  Without
     the row `tracked` the policies are streamed: driven by the sensors alone, from the default pose.
+    Args      numbers : path -> a line under that policy's pictures, or None
     Test      tests/test_play.py::test_comparison_sheet
     """
     from plumbing import render
@@ -125,20 +138,33 @@ def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320)):
     wide.type, wide.trackbodyid, wide.distance = mujoco.mjtCamera.mjCAMERA_TRACKING, arms[0].char.root, 3.5
     wide.azimuth, wide.elevation = 205, -8
     human = retarget.draw(arms[0].char, clip, pose, frames, size, wide, beside)
-    rows = [(f"human and kinematic {name_of(arms[0].char)}: {clip.name}", human, times)]
+    rows, view = [(f"human and kinematic {name_of(arms[0].char)}: {clip.name}", human, times)], same_view(arms)
     for a in arms:
         recording, seen = played(a, clip, opt)
         lived = [t for t in frames if t < len(recording.frames)]
         gone = len(frames) - len(lived)
-        images = pictures(a.char, seen, recording, lived, size)
+        images = pictures(a.char, seen, recording, lived, size, camera=view)
         images += [np.full_like(images[0], 255)] * gone
         end = f"failed at {(len(recording.frames) - 1) / rate:.1f} s"
         rows.append((a.title(), images, times[: len(lived)] + [end] * gone))
     sheets = []
-    for title, images, labels in rows:
+    for (title, images, labels), under in zip(rows, [None, *((numbers or {}).get(a.path) for a in arms)], strict=True):
         sheet = render.contact_sheet(images, labels, len(images))
-        sheets += [render.label_image(np.full((20, sheet.shape[1], 3), 120, np.uint8), title), sheet]
+        sheets += [*lines_of(title, sheet.shape[1]), sheet, *(lines_of(under, sheet.shape[1]) if under else [])]
     return np.vstack(sheets)
+
+
+def lines_of(text, width):
+    """Text as bands of an image, as many of its parts a band as there is room for; two spaces part them.
+
+    Test      tests/test_play.py::test_figure"""
+    from plumbing import render
+
+    lines = [""]
+    for part in text.split("  "):
+        longer = f"{lines[-1]}  {part}".strip()
+        lines[-1:] = [longer] if 12 * len(longer) <= width - 4 or not lines[-1] else [lines[-1], part]
+    return [render.label_image(np.full((20, width, 3), 120, np.uint8), line) for line in lines]
 
 
 def played(arm: Arm, clip, opt: Options):
@@ -157,10 +183,25 @@ def played(arm: Arm, clip, opt: Options):
     return SimpleNamespace(qpos=r.qpos[:lived], frames=np.arange(lived)), seen
 
 
-def pictures(char: Character, ref: Reference, recording: Recording, frames, size=(480, 360), fast=False):
+def same_view(arms: list[Arm]):
+    """One camera for bodies of several sizes, or None: each body has its own, by which all would look alike.
+
+    Test      tests/test_play.py::test_same_view"""
+    hips = {a.char.name: set() for a in arms}
+    for a in arms:
+        hips[a.char.name].add(a.char.hip_height)
+    if all(len(h) == 1 for h in hips.values()):
+        return None
+    view = mujoco.MjvCamera()
+    view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, arms[0].char.root
+    view.distance, view.azimuth, view.elevation = 7.0 * max(max(h) for h in hips.values()), 205, -8
+    return view
+
+
+def pictures(char: Character, ref: Reference, recording: Recording, frames, size=(480, 360), fast=False, camera=None):
     """Images (H, W, 3) of the character with the three sensor poses it was given.
 
-    Args      frames : indices into the recording
+    Args      frames : indices into the recording; camera : as `render.Scene.frame` has it
     Test      tests/robustness/test_cli.py::test_play_png
     """
     from plumbing import render
@@ -173,7 +214,7 @@ def pictures(char: Character, ref: Reference, recording: Recording, frames, size
         data.qpos[:] = recording.qpos[t]
         mujoco.mj_forward(shown, data)
         f = recording.frames[t]
-        images.append(scene.frame(data, markers=render.device_markers(ref.sensor_pos[f], ref.sensor_quat[f])))
+        images.append(scene.frame(data, camera, render.device_markers(ref.sensor_pos[f], ref.sensor_quat[f])))
     return images
 
 
@@ -291,6 +332,72 @@ def _open_viewer(model, data, root, how, port):
     handle = launch_thread.launch_thread(serve)
     handle.set_model(model, data=data)
     return handle
+
+
+# ------------------------------------------------------------------------------------ figures of the paper
+
+USER = "walk_105"  # the built-in walk of the figures, unless --motion or --clips says another
+
+
+def figure_options(opt: Options, argv) -> Options:
+    """The options of --figure as those of a comparison of its policies.
+
+    Raises    UserError: a policy of it is not there, or flags that would do nothing
+    Test      tests/test_play.py::test_figure_options"""
+    given = given_flags(argv)
+    may = OF_MOTION - {"rows", "random_starts"} | {"figure", "png", "video", "seconds", "every", "threads", "seed"}
+    if wrong := sorted(given - may):
+        raise UserError(f"--figure {opt.figure}: has its own policies, streamed: leave out --{', --'.join(wrong)}")
+    paths = [Path(os.path.relpath(CHARACTERS / f"{name}.npz")) for name in FIGURES[opt.figure]]
+    if gone := [p for p in paths if not p.is_file()]:
+        make = f"python -m extras.arms run {gone[0].stem}, then python -m extras.policies ship"
+        raise UserError(f"--figure {opt.figure}: no policy {gone[0]}; train one: {make}")
+    clips = opt.clips if given & {"motion", "clips"} else USER
+    png = opt.png or (None if opt.video else f"figure-{opt.figure}.png")
+    return replace(opt, compare=tuple(map(str, paths)), rows=("streamed",), clips=clips, png=png)
+
+
+def play_figure(opt: Options) -> None:
+    """Play a figure's policies on one user; print their numbers, and put them under the pictures.
+
+    Test      tests/test_play.py::test_figure"""
+    from plumbing import render
+
+    check_folders(opt.png, opt.video, read=mocap.data.parts(opt.motion))
+    _, long = metrics.motion_of(opt)
+    clip = chosen(long, opt)
+    arms, columns = metrics.arms_of([clip], opt), [c for c in metrics.COLUMNS if c[0] in OF_FIGURE]
+    rows = {a.path: metrics.streamed(a.char, a.policy.mean_action, [clip], a.devices, opt.threads) for a in arms}
+    print(*(a.title() for a in arms), metrics.comparison(rows, columns), sep="\n")
+    cells = {path: zip(columns, metrics.cells("", row, columns)) for path, row in rows.items()}
+    numbers = {path: "  ".join(f"{head} {text}" for (_, head, _), text in pairs) for path, pairs in cells.items()}
+    numbers = {path: text.replace("°", "deg").replace("³", "3") for path, text in numbers.items()}  # the font's letters
+    if opt.png:
+        render.write_png(opt.png, comparison_sheet(arms, clip, replace(opt, sequence=0), numbers=numbers))
+        print(opt.png)
+    if opt.video:
+        render.write_video(opt.video, film(arms, clip, opt, numbers), CONTROL_RATE)
+        print(opt.video)
+
+
+def film(arms: list[Arm], clip, opt: Options, numbers, size=(480, 480)):
+    """Images of a video: the policies side by side, streamed on one user, names above, numbers under each.
+
+    One that has failed is white from then on.
+    Test      tests/test_play.py::test_figure"""
+    from plumbing import render
+
+    clip = stream_of(arms[0].char, clip)[2]
+    last, films = min(len(clip) - 1, EPISODE_STEPS, round((opt.seconds or 10.0) * CONTROL_RATE)), []
+    for a in arms:
+        recording, seen = played(a, clip, opt)
+        lived = range(min(last + 1, len(recording.frames)))
+        films.append(pictures(a.char, seen, recording, lived, size, True, same_view(arms)))
+    under = [np.vstack(lines_of(numbers[a.path], size[0])) for a in arms]
+    for t in range(last + 1):
+        shown = [f[t] if t < len(f) else np.full_like(f[0], 255) for f in films]
+        named = [render.label_image(image, name_of(a.char)) for image, a in zip(shown, arms, strict=True)]
+        yield render.hstack([np.vstack(parts) for parts in zip(named, under, strict=True)])
 
 
 # ------------------------------------------------------------------------------------ a headset's stream
@@ -521,7 +628,8 @@ def check_options(opt: Options, argv) -> None:
     Test      tests/robustness/test_cli.py::test_play_flags_that_would_do_nothing"""
     if not (opt.measure or opt.png or opt.video or opt.bvh or opt.view or opt.stream or opt.compare):
         raise UserError(
-            "nothing to do: give --measure, --compare A B, --png OUT, --video OUT, --bvh OUT, --view or --stream FILE"
+            "nothing to do: give --measure, --compare A B, --figure 5, --png OUT, --video OUT, --bvh OUT, --view or "
+            "--stream FILE"
         )
     if opt.compare:
         metrics.check_comparison(opt)
@@ -560,6 +668,9 @@ def main(argv=None):
         if a == "--view" and (i + 1 == len(argv) or argv[i + 1].startswith("--")):
             argv[i] = "--view=window"
     opt = cli(Options, argv, "play.py", __doc__)
+    if opt.figure:
+        play_figure(figure_options(opt, argv))
+        return 0
     check_options(opt, argv)
     if opt.compare:
         _compare(opt)
@@ -585,13 +696,21 @@ def main(argv=None):
 def _compare(opt: Options) -> None:
     """The table, and the figure."""
     arms, clips = metrics.run_comparison(opt)
-    if opt.sequence >= len(clips):
-        raise UserError(f"--sequence {opt.sequence}: there are {len(clips)}, from 0")
+    clip = chosen(clips, opt)
     if opt.png:
         from plumbing import render
 
-        render.write_png(opt.png, comparison_sheet(arms, clips[opt.sequence], opt))
+        render.write_png(opt.png, comparison_sheet(arms, clip, opt))
         print(opt.png)
+
+
+def chosen(clips, opt):
+    """The clip that --sequence names.  UserError: there are not so many
+
+    Test      tests/test_play.py::test_what_cannot_be_done_is_said_first"""
+    if opt.sequence >= len(clips):
+        raise UserError(f"--sequence {opt.sequence}: there are {len(clips)}, from 0")
+    return clips[opt.sequence]
 
 
 def sequence_of(char: Character, opt) -> Reference:
@@ -603,9 +722,7 @@ def sequence_of(char: Character, opt) -> Reference:
     Test      tests/test_play.py::test_what_cannot_be_done_is_said_first"""
     split = "all" if opt.all else opt.split
     clips = mocap.data.sequences(opt.motion, split, opt.clips, seed=opt.seed, reading=Reading.of(opt))
-    if opt.sequence >= len(clips):
-        raise UserError(f"--sequence {opt.sequence}: there are {len(clips)}, from 0")
-    clip = clips[opt.sequence]
+    clip = chosen(clips, opt)
     return retarget.reference(char, [clip if opt.user_scale == 1.0 else resize(clip, opt.user_scale)])
 
 

@@ -77,6 +77,23 @@ def split_of(path) -> str:
     return "validation" if number and number.group(1).endswith("5") else "train"
 
 
+# AMASS's protocol 1, its CMU trials: what AvatarPoser tests on (data_split/CMU/test_split.txt of its repository, which
+# AGRoL and HMD-Poser took over) beside trials of BioMotionLab and HDM05.  `mocap fetch cmu` gets eight of them
+PROTOCOL1 = """
+01_02 05_04 07_08 07_09 07_10 08_01 10_02 10_05 102_14 102_19 102_23 103_01 103_02 103_05 105_05 105_19 105_21 105_31
+105_39 105_45 105_50 105_52 106_01 106_14 106_16 106_17 107_03 108_04 108_06 108_07 108_08 108_16 108_18 108_21 108_26
+111_01 111_13 111_32 111_33 113_01 113_14 118_02 118_09 118_17 120_05 120_08 120_16 122_12 122_43 122_59 122_66 122_67
+123_07 125_03 125_06 126_02 126_05 127_02 127_26 13_10 13_12 13_34 131_07 132_05 132_15 132_28 132_33 132_47 133_23
+133_25 135_04 136_01 136_11 136_14 136_23 136_29 137_06 137_12 137_14 137_18 139_34 141_02 141_07 141_09 141_22 142_02
+142_11 142_19 143_01 143_07 143_39 143_40 144_03 144_06 144_17 15_06 15_07 15_10 16_34 17_05 17_07 18_02 18_04 18_08
+18_09 18_10 18_14 20_04 22_17 22_18 22_22 27_11 29_03 29_08 29_19 30_02 30_09 30_17 31_19 35_08 35_16 35_18 35_26
+35_28 35_29 36_07 36_14 36_19 36_20 36_22 40_11 41_03 41_04 54_03 54_05 54_06 54_17 54_20 55_11 55_20 55_28 60_05
+60_08 62_12 62_18 62_25 63_02 63_09 63_15 63_20 63_26 64_16 64_17 64_21 74_13 77_02 77_09 77_16 77_32 78_05 78_34
+79_13 79_21 79_24 79_26 79_27 79_36 79_50 79_65 79_77 79_94 80_14 80_18 80_31 80_36 80_67 82_17 83_14 83_16 83_26
+83_32 83_35 83_39 83_43 83_46 83_55 83_59 83_68 84_04 84_16 85_08 86_04 86_05 86_15 88_10 90_12 90_18 90_19 90_23
+91_06 91_36 91_37 91_42 91_43 91_45 93_06 94_16
+"""
+NAMED = {"protocol1": frozenset(PROTOCOL1.split())}  # sets of clips that --clips knows by name
 BUILTIN = {"builtin": gait.MIX, "standing": gait.STANDING}  # the data sets that need no download
 MOTION = "builtin, standing, a .bvh or .amc file, a folder of them, several with commas between them"
 
@@ -86,7 +103,7 @@ class MotionFlags:
     """The flags of every command that reads motion: which, and what the user says of its files."""
 
     motion: str = arg("builtin", MOTION)
-    clips: str = arg("*", "shell pattern on clip names, such as '*walk*'")
+    clips: str = arg("*", f"shell pattern on clip names, such as '*walk*'; or a named set: {', '.join(NAMED)}")
     joint_map: str | None = arg(None, HELP["joint_map"])
     unit: str | None = arg(None, HELP["unit"])
     up: str | None = arg(None, HELP["up"])
@@ -157,7 +174,8 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
 
     Args      motion : "builtin", "standing", a .bvh or .amc file, or a folder of them (searched below); or several of
               these with commas between them: each must have what is asked for
-              clips : shell pattern on the names; reading : what the user says about joints, unit and axes of BVH files
+              clips : shell pattern on the names, or one of NAMED
+              reading : what the user says about joints, unit and axes of BVH files
               split : train | validation | style | body | all.  A folder of fewer than ten files none of whose names is
               in the split is used whole, and says so.  People of UNSEEN are in `body` alone, unless motion holds nobody
               else: then they are meant, are split by their trials for train and validation, and it says so
@@ -184,7 +202,8 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
             print(f"{motion}: only people held out as unseen bodies: meant, and split by their trials", file=sys.stderr)
             keys = [k.stem.rpartition("_")[2] for k in keys]
         items = [(f.stem, key, f) for f, key in zip(files, keys, strict=True)]
-    matching = [(name, split_of(key), item) for name, key, item in items if fnmatchcase(name, clips)]
+    asked = NAMED[clips].__contains__ if clips in NAMED else lambda name: fnmatchcase(name, clips)
+    matching = [(name, split_of(key), item) for name, key, item in items if asked(name)]
     chosen = [item for _, part, item in matching if split in ("all", part)]
     bodies = sum(part == "body" for _, part, _ in matching)
     if split == "train" and bodies:

@@ -2,6 +2,8 @@
 
 import functools
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from mocap import data
 from plumbing import render
 from plumbing.cli import UserError
 from plumbing.runs import save_checkpoint
-from policy import Policy, load_policy
+from policy import Policy, load_policy, trained_as
 
 COLUMNS = [key for key, *_ in metrics.COLUMNS]
 
@@ -430,10 +432,89 @@ def test_comparison_sheet(two, tmp_path, monkeypatch):
     times = np.unique(np.arange(0, 45, 44 / 7).round().astype(int))
     np.testing.assert_array_equal(white, [[False] * 8, white[1], [t >= len(lived.frames) for t in times]])
     assert not white[:, 0].any() and white[2, -1]
-    blank = lambda *a: [np.zeros((80, 96, 3), np.uint8)] * len(a[3])  # noqa: E731, drawing is slow
+    blank = lambda *a, **_: [np.zeros((80, 96, 3), np.uint8)] * len(a[3])  # noqa: E731, drawing is slow
     monkeypatch.setattr(retarget, "draw", blank), monkeypatch.setattr(play, "pictures", blank)
     coarse = play.comparison_sheet(arms, clips[0], play.Options(threads=1, every=0.5, seconds=1.0), size=(96, 80))
     assert coarse.shape[1] == 3 * 96
+
+
+@pytest.fixture
+def figure(two, monkeypatch):
+    """Figure 6 is two untrained policies, on a second and a half of a walk."""
+    clip = data.load("builtin")[0]
+    monkeypatch.setattr(play, "CHARACTERS", two[0].parent)
+    monkeypatch.setitem(play.FIGURES, 6, tuple(p.stem for p in two))
+    monkeypatch.setattr(metrics, "motion_of", lambda opt: ([clip], [clip]))
+    return clip
+
+
+def test_figure(two, figure, tmp_path, monkeypatch, capsys):
+    """The numbers are `metrics.streamed`'s; the sheet has a band of them under every policy; so has the video."""
+    if render.gl_backend() is None:
+        pytest.skip("no OpenGL")
+    plain = play.comparison_sheet
+    monkeypatch.setattr(play, "comparison_sheet", lambda *a, **k: plain(*a, size=(300, 80), **k))
+    assert play.main(["--figure", "6", "--png", str(tmp_path / "f.png"), "--seconds", "1", "--threads", "1"]) == 0
+    [arm, _] = metrics.arms_of([figure], play.Options(compare=tuple(map(str, two)), threads=1))
+    row = metrics.streamed(arm.char, arm.policy.mean_action, [figure], arm.devices, 1)
+    said = capsys.readouterr().out
+    assert f"| root cm | {row['root_cm']:.1f} |" in said and "| joints cm |" not in said
+    options = play.Options(figure=6, compare=tuple(map(str, two)), rows=("streamed",), threads=1, seconds=1.0)
+    arms = metrics.arms_of([figure], options)
+    numbers = {a.path: "one 1  two 2" for a in arms}
+    with_numbers, without = plain(arms, figure, options, numbers=numbers), plain(arms, figure, options)
+    assert len(with_numbers) - len(without) == 2 * 20 and with_numbers.shape[1] == without.shape[1]
+    np.testing.assert_array_equal(with_numbers[-20:], play.lines_of("one 1  two 2", without.shape[1])[0])
+    images = list(play.film(arms, figure, options, numbers, size=(96, 80)))
+    height = 80 + 20 * len(play.lines_of("one 1  two 2", 96))
+    assert len(images) == 31 and {i.shape for i in images} == {(height, 2 * 96, 3)}
+    bands = play.lines_of("one 1  two 2  " + "x" * 99, 160)
+    assert len(bands) == 2 and {b.shape for b in bands} == {(20, 160, 3)}
+
+
+def test_same_view():
+    """Bodies of one size, or two characters, keep their own cameras; two sizes of one are seen from one distance."""
+    arm = lambda name, scale=1.0: SimpleNamespace(char=character.load(name, scale=scale))  # noqa: E731
+    assert play.same_view([arm("oppy"), arm("oppy")]) is None and play.same_view([arm("oppy"), arm("jesse")]) is None
+    view = play.same_view([small := arm("oppy", 0.9), tall := arm("oppy", 1.15)])
+    assert view.distance == pytest.approx(7 * tall.char.hip_height) and view.trackbodyid == small.char.root
+
+
+def test_figure_options(figure, tmp_path, monkeypatch):
+    """One walk of one user unless another is asked for; a picture unless a video is; no flags of other plays."""
+    of = lambda *argv: play.figure_options(play.cli(play.Options, ["--figure", "6", *argv], "t", ""), argv)  # noqa: E731
+    opt = of()
+    assert (opt.clips, opt.png, opt.rows) == (play.USER, "figure-6.png", ("streamed",))
+    assert [Path(p).stem for p in opt.compare] == list(play.FIGURES[6])
+    assert of("--motion", "x").clips == "*" and of("--clips", "turn_115").clips == "turn_115"
+    assert of("--video", "v.mp4").png is None
+    for wrong in (["--policy", "x"], ["--rows", "tracked"], ["--bvh", "x"], ["--sensors", "hmd"]):
+        with pytest.raises(UserError, match=f"--figure 6: has its own policies, streamed: leave out {wrong[0]}"):
+            of(*wrong)
+    monkeypatch.setitem(play.FIGURES, 6, ("dino", "dino-gone"))
+    monkeypatch.setattr(play, "CHARACTERS", tmp_path)
+    (tmp_path / "dino.npz").touch()
+    with pytest.raises(UserError, match="no policy .*dino-gone.npz; train one: python -m extras.arms run dino-gone"):
+        of()
+
+
+def test_shipped_figures():
+    """What is shipped of a figure is small, and of the body or reward that it is about; Figs. 5 and 8 are whole."""
+    told = {"small": "scale", "tall": "scale", "passive": "tail", "fixed": "tail", "orientation": None}
+    there = {n for names in play.FIGURES.values() for n in names if (character.CHARACTERS / f"{n}.npz").is_file()}
+    assert there >= {*play.FIGURES[5], *play.FIGURES[8]}
+    for name in there:
+        path = character.CHARACTERS / f"{name}.npz"
+        _, meta = load_policy(path)
+        own, (_, _, kind) = trained_as(meta, path), name.partition("-")
+        assert list(own.load().variant) == ([told[kind]] if kind and told[kind] else []), name
+        assert ("orientation" in meta["options"]["without"]) == (kind == "orientation")
+        if kind:
+            assert path.stat().st_size < 1.5e6
+        if told.get(kind) == "scale":
+            assert (own.scale < 1) == (kind == "small")
+        elif told.get(kind) == "tail":
+            assert own.tail == kind
 
 
 def test_told_life():

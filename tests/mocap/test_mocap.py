@@ -6,6 +6,7 @@ Tests on recorded motion find it through the environment variable MOCAP_DIR; wit
 import re
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ from human import (
     resample,
     sensors,
 )
-from mocap import augment, bvh, data, gait, inspect, stitch
+from mocap import augment, bvh, data, fetch, gait, inspect, stitch
 from mocap.rigs import RIGS, _axis, from_amc, rig_of
 from plumbing.cli import UserError
 
@@ -709,6 +710,20 @@ def test_split(tmp_path):
     names = {s: {c.name for c in data.load("builtin", split=s)} for s in ("train", "validation", "all")}
     assert names["train"] | names["validation"] == names["all"] and not names["train"] & names["validation"]
     assert names["validation"] == {n for n in names["all"] if n.endswith("5")}
+
+
+def test_protocol1(tmp_path):
+    """A named set picks the files that bear its names; `mocap fetch cmu` gets eight of them, all of unseen people."""
+    clip = still(2)
+    for name in ("07_08", "07_07", "135_04", "walk_1"):
+        write_as(tmp_path / f"{name}.bvh", "bandai", clip)
+    assert [c.name for c in data.load(tmp_path, clips="protocol1")] == ["07_08", "135_04"]
+    named = data.NAMED["protocol1"]
+    assert len(named) == 207 and all(re.fullmatch(r"\d\d+_\d\d", n) for n in named)
+    got = {Path(f[0]).stem for f in fetch.DATASETS["cmu"].files} & named
+    assert len(got) == 8 and {data.split_of(f"{n}.amc") for n in got} == {"body"}
+    with pytest.raises(UserError, match="builtin: no clip matches 'protocol1'"):
+        data.load("builtin", clips="protocol1")
 
 
 def test_small_sets_are_used_whole(tmp_path, capsys):

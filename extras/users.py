@@ -1,0 +1,148 @@
+r"""Users of other builds through the whole pipeline, and how a character fails under them  [Reda23 §4.1].
+
+    python -m extras.users --motion FOLDER --clips '*walk*'                  by height, 1.45 to 2.00 m, and by build
+    python -m extras.users --motion FOLDER --as-is                           the users as they are: dance, sport, arms
+
+    clip ──► of_build ──► recorded headset, calibrated ──► ride ──► completed, falls, losses, errors
+             joints       by its first second              streamed, from the default pose
+
+Nothing is told of a user's build: stature, trunk and arms change the human, from it the devices are taken, and from
+their first second the calibration.  Falls and losses are counted apart: to topple is not to be left behind.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from dataclasses import dataclass, fields
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as ppo.py does, and says why; before NumPy is loaded
+
+import numpy as np
+
+import metrics
+from character import Character
+from headset.player import Player, ride, stream_of
+from human import SENSOR_OFFSETS, headset_height
+from mocap.augment import resize
+from mocap.data import CONTROL_RATE, parts
+from play import slides_of
+from plumbing.cli import ALL_POSITIVE, THREADS, arg, cell, cli, markdown, run_main
+from plumbing.files import atomic_write, check_folders
+from policy import check_fits, devices_of, find_policy, load_character
+
+EYES = 0.936  # ASSUMED: of a standing person's stature, where the headset sits (Drillis and Contini 1966: eye height)
+BUILDS = {  # ASSUMED: trunk and arms in proportion to the legs, as times the recorded person's
+    "": (1.0, 1.0),
+    "long trunk": (1.25, 1.0),  # most of the way from Bandai's actor to CMU's people
+    "long arms": (1.0, 1.15),
+    "short arms": (1.0, 0.85),
+}
+MIDDLE = 1.75  # m: at other heights the arms are as recorded
+
+
+@dataclass
+class Options(metrics.MotionFlags):
+    """Whose policies, under which users."""
+
+    characters: tuple[str, ...] = arg(
+        ("jesse", "oppy", "dino"), "names or .toml paths, the .npz beside it", check=(len, "one or more names")
+    )
+    heights: tuple[float, ...] = arg((1.45, 1.6, MIDDLE, 1.9, 2.0), "statures of the users [m]", check=ALL_POSITIVE)
+    as_is: bool = arg(False, "the users as they were recorded, one row")
+    split: str = arg("validation", "which part", choices=("train", "validation", "style", "body"))
+    half: str = arg("report", "of the part: select, report, or both", choices=tuple(metrics.HALVES))
+    json: str | None = arg(None, "write the table here")
+    threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
+
+
+def stature(clip) -> float:
+    """A standing user's height [m], from where the headset is.  Test: tests/extras/test_users.py::test_of_build"""
+    return headset_height(clip) / EYES
+
+
+def of_build(clip, height, trunk=1.0, arms=1.0):
+    """The same motion by a user of this stature [m], whose trunk and arms are so many times as long beside the legs.
+
+    Test      tests/extras/test_users.py::test_of_build"""
+    shaped, above = resize(clip, 1.0, arms, trunk), float(SENSOR_OFFSETS[0, 2])  # a headset sits so far above the joint
+    return resize(shaped, (EYES * height - above) / (headset_height(shaped) - above))
+
+
+def users(opt: Options) -> dict:
+    """Row name -> function of a clip: who plays it.  Test: tests/extras/test_users.py::test_rows"""
+    if opt.as_is:
+        return {"as recorded": lambda clip: clip}
+    rows = {}
+    for height in opt.heights:
+        for name, (trunk, arms) in BUILDS.items():
+            if arms == 1.0 or height == MIDDLE:
+                title = f"{height:.2f} m" + (f", {name}" if name else "")
+                rows[title] = lambda clip, build=(height, trunk, arms): of_build(clip, *build)
+    return rows
+
+
+def row_of(char: Character, act, clips, devices, threads) -> dict:
+    """What a character does under users, each a capture: numbers as `metrics.streamed`'s, and why it failed.
+
+    Errors    of headset and controllers over all frames [cm]; own slide without the jumps to where it is stood up
+    Test      tests/extras/test_users.py::test_row"""
+    streams = [stream_of(char, clip, devices)[:2] for clip in clips]
+    rides = ride(char, act, streams, devices, threads)
+    ticks, failures = np.array([len(r.qpos) for r in rides]), np.array([r.failures for r in rides])
+    first = np.array([r.lives[0][1] if r.failures else len(r.qpos) for r in rides])
+    ends, slides = sum((r.ends for r in rides), Counter()), np.concatenate([slides_of(char, r) for r in rides])
+    total = ticks.sum()
+    return {
+        "captures": len(rides),
+        "completed": float(np.mean(failures == 0)),
+        "survival": float(np.mean(first / ticks)),
+        "fails_every_s": total / CONTROL_RATE / failures.sum() if failures.any() else float("inf"),
+        "first_failure_s": float(np.median(first[failures > 0]) / CONTROL_RATE) if failures.any() else float("inf"),
+        "falls": ends["fall"],
+        "lost": ends["away"],
+        "diverged": ends["bad"],
+        "head_cm": 100 * sum(r.head for r in rides) / total,
+        "hands_cm": 100 * sum(r.hands for r in rides) / total if devices == 3 else float("nan"),
+        "own_slide_cm_s": 100 * float(slides.mean()) if len(slides) else float("nan"),
+    }
+
+
+COLUMNS = {
+    "captures": "{:d}",
+    "completed": "{:.2f}",
+    "survival": "{:.2f}",
+    "fails_every_s": "{:.1f}",
+    "first_failure_s": "{:.1f}",
+    "falls": "{:d}",
+    "lost": "{:d}",
+    "diverged": "{:d}",
+    "head_cm": "{:.1f}",
+    "hands_cm": "{:.1f}",
+    "own_slide_cm_s": "{:.1f}",
+}
+
+
+def main(argv=None):
+    """Print the table.  Test: tests/extras/test_users.py::test_command"""
+    opt = cli(Options, list(argv or []), "extras.users", __doc__)
+    check_folders(opt.json, read=parts(opt.motion))
+    asked = {f.name: getattr(opt, f.name) for f in fields(metrics.MotionFlags)}
+    captures, _ = metrics.motion_of(metrics.Options(**asked, split=opt.split, half=opt.half))
+    print(markdown([["", *(k.replace("_", " ") for k in COLUMNS)]]), flush=True)
+    out = {}
+    for name in opt.characters:
+        own = metrics.Options(character=name)
+        policy, path, meta = find_policy(own)
+        char, devices = load_character(own, meta, path), devices_of(meta, path, None)
+        check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
+        for title, played_by in users(opt).items():
+            row = row_of(char, policy.mean_action, [played_by(c) for c in captures], devices, opt.threads)
+            out[title := f"{metrics.name_of(char)}: {title}"] = row
+            print("| " + " | ".join([title, *(cell(row[k], f) for k, f in COLUMNS.items())]) + " |", flush=True)
+    if opt.json:
+        atomic_write(opt.json, metrics.as_json(out))
+
+
+if __name__ == "__main__":
+    run_main(main)

@@ -1,0 +1,73 @@
+"""extras/users.py: builds, the rows of the table, and one row against `metrics.streamed`."""
+
+import json
+
+import numpy as np
+import pytest
+
+import character
+import metrics
+from extras import users
+from human import SEG, headset_height
+from mocap import data
+from plumbing.cli import run_main
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return data.load("builtin", clips="walk_105")[0][:60]
+
+
+def length(clip, a, b):
+    return np.linalg.norm(clip.pos[:, SEG[a]] - clip.pos[:, SEG[b]], axis=1).mean()
+
+
+def test_of_build(clip):
+    """The stature asked for; trunk and arms grow beside the legs by their factors, and keep their directions."""
+    legs = length(clip, "thigh_l", "shin_l")
+    for height, trunk, arms in ((1.45, 1.0, 1.0), (2.0, 1.25, 1.0), (1.75, 1.0, 0.85)):
+        other = users.of_build(clip, height, trunk, arms)
+        assert headset_height(other) / users.EYES == pytest.approx(height, rel=1e-6)
+        bigger = length(other, "thigh_l", "shin_l") / legs
+        assert length(other, "pelvis", "chest") / length(clip, "pelvis", "chest") == pytest.approx(bigger * trunk)
+        assert length(other, "upper_arm_r", "forearm_r") / length(clip, "upper_arm_r", "forearm_r") == pytest.approx(
+            bigger * arms
+        )
+        np.testing.assert_array_equal(other.quat, clip.quat)
+    assert users.of_build(clip, users.stature(clip)).pos == pytest.approx(clip.pos)
+
+
+def test_rows(clip):
+    """Every height as recorded and with a long trunk; arms at one height alone; or one row of the users as they are."""
+    rows = users.users(users.Options(heights=(1.5, users.MIDDLE)))
+    assert list(rows) == [
+        "1.50 m", "1.50 m, long trunk", "1.75 m", "1.75 m, long trunk", "1.75 m, long arms", "1.75 m, short arms"
+    ]  # fmt: skip
+    assert [round(users.stature(f(clip)), 6) for f in rows.values()] == [1.5] * 2 + [1.75] * 4
+    [(_, same)] = users.users(users.Options(as_is=True)).items()
+    assert same(clip) is clip
+
+
+def test_row(clip):
+    """A policy that does nothing falls; the numbers are those of `metrics.streamed`, and falls and losses are told."""
+    char, act = character.load("jesse"), lambda obs: np.zeros((len(obs), 33))
+    row, other = users.row_of(char, act, [clip], 3, 1), metrics.streamed(char, act, [clip], 3, 1)
+    assert row["falls"] + row["lost"] + row["diverged"] == other["failures"] > 0
+    for key in ("completed", "survival", "fails_every_s", "first_failure_s"):
+        assert row[key] == pytest.approx(other[key]), key
+    assert row["captures"] == 1 and row["head_cm"] > 5
+
+
+def test_command(clip, tmp_path, monkeypatch, capsys):
+    """A line for every character and user, as JSON too; a wrong split is said in a line."""
+    monkeypatch.setattr(metrics, "motion_of", lambda opt: ([clip], []))
+    flags = ["--heights", "1.5", "--threads", "1", "--json", str(tmp_path / "u.json")]
+    users.main(["--characters", "oppy", *flags])
+    out, found = capsys.readouterr().out, json.loads((tmp_path / "u.json").read_text())
+    assert list(found) == ["oppy: 1.50 m", "oppy: 1.50 m, long trunk"]
+    for title, row in found.items():
+        assert f"| {title} | 1 | {row['completed']:.2f} |" in out
+    monkeypatch.undo()
+    with pytest.raises(SystemExit):
+        run_main(users.main, ["--clips", "swim*"])
+    assert "no clip matches 'swim*'" in capsys.readouterr().err
