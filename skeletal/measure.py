@@ -15,12 +15,13 @@ from pathlib import Path
 import numpy as np
 
 import mocap.data
-from plumbing.cli import COUNT, UserError, arg, cli
+from plumbing.cli import COUNT, POSITIVE, UserError, arg, cli
 from plumbing.files import atomic_write, check_folders
 from plumbing.runs import versions
 from skeletal import data, rigs
 from skeletal.correct import LAFAN_TRAIN, SHIPPED, Correction, bases_of, limbs
 from skeletal.data import RATE, Motion
+from skeletal.pictures import draw
 
 ROWS = ("network", "network_clean", "shifted_copy", "copy", "ik", "mean_pose", "truth")
 METRICS = ("joint", "ee", "slide_cm_s")
@@ -39,7 +40,7 @@ class MeasureOptions:
     limit: int = arg(3, "clips a pair at most", check=COUNT)
     json: str | None = arg(None, "write the figures here")
     png: str | None = arg(None, "folder for a sheet a pair: source, result over truth")
-    every: float = arg(0.6, "seconds between the pictures of a sheet")
+    every: float = arg(0.6, "seconds between the pictures of a sheet", check=POSITIVE)
 
 
 def unseen(name, opt) -> list:
@@ -136,9 +137,22 @@ def averaged(rows) -> dict:
     return {k: {v: float(np.mean([r[k][v] for r in rows])) for v in METRICS} for k in rows[0]}
 
 
-def table(nets, opt) -> dict:
+def sheets(net: Correction, found, opt):
+    """One contact sheet a pair: the source, and the result after the clean-up over the truth.
+
+    Raises    UserError: no such folder, or no OpenGL"""
+    drawn = set()
+    for name, source, m, target, true in found:
+        if name not in drawn:
+            drawn.add(name)
+            got = data.clean_feet(net(m, source, true.skeleton, target), data.contacts(m))
+            path, labels = Path(opt.png) / f"{name}.png", ["source", "network", "truth"]
+            draw([m, got, true], labels, path, None, opt.every, (0, 1, 1))
+
+
+def table(nets, found) -> dict:
     """All pairs: rows averaged over clips and, for networks, over seeds; and each seed's own."""
-    found, out = cases(nets[0], opt), {}
+    out = {}
     for case in found:
         base = baselines(nets[0], case)
         own = [network_rows(net, case) for net in nets]
@@ -163,11 +177,12 @@ def summary(pairs) -> dict:
 def measure(argv) -> int:
     """python -m skeletal measure.  Test: tests/skeletal/test_skeletal_correct.py::test_measure"""
     opt = cli(MeasureOptions, argv, "python -m skeletal measure", MeasureOptions.__doc__)
-    check_folders(opt.json)
+    check_folders(opt.json, Path(opt.png) / "sheet.png" if opt.png else None)
     nets = [Correction(p) for p in opt.weights.split(",")]
     if any(n.names != nets[0].names for n in nets):
         raise UserError(f"--weights {opt.weights}: trained on different rigs; valid: seeds of one training")
-    result = table(nets, opt)
+    found = cases(nets[0], opt)
+    result = table(nets, found)
     result |= summary(result["pairs"])
     head = f"{'':22s}" + "".join(f"{r:>26s}" for r in ROWS)
     print(head)
@@ -177,6 +192,8 @@ def measure(argv) -> int:
     gain = ", ".join(f"{k} {100 * v:.0f} % ({ahead[k]} of {of} pairs)" for k, v in result["gain"].items())
     print(f"network below the shifted copy by {gain}")
     print(LEGEND)
+    if opt.png:
+        sheets(nets[0], found, opt)
     if opt.json:
         atomic_write(opt.json, json.dumps(result | {"versions": versions()}, indent=2) + "\n")
     return 0

@@ -34,7 +34,7 @@ def draw(motions, labels, png=None, video=None, every=0.5, lanes=None):
         p = data.pose(m)[0]
         p = (p - [*p[0, 0, :2], np.percentile(p[..., 2].min(axis=1), 5)]) / m.skeleton.leg
         place = p[:, :1] * [1.0, 1.0, 0.0]
-        p = p - place + [0.0, LANE * (0.5 * (across - 1) - lane), 0.0]  # every figure walks on its own spot
+        p = p - place + [0.0, LANE * (lane - 0.5 * (across - 1)), 0.0]  # every figure walks on its own spot
         poses.append(p)
     count = min(map(len, poses))
     height = max(p[..., 2].max() for p in poses)
@@ -60,5 +60,5 @@ def _camera(height):
     """From the side ahead, so near that the tallest figure fills the cell."""
     camera = mujoco.MjvCamera()
     camera.lookat[:] = [0.0, 0.0, 0.5 * height]
-    camera.distance, camera.azimuth, camera.elevation = 1.55 * height, 150, -8
+    camera.distance, camera.azimuth, camera.elevation = 1.75 * height, 150, -8
     return camera

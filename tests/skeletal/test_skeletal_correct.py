@@ -1,5 +1,6 @@
 """skeletal/correct.py and skeletal/measure.py: corrections of copies between rigs, and what they gain."""
 
+import importlib.util
 import json
 from dataclasses import replace
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 import character
+from mocap import bvh
 from mocap import data as captures
 from plumbing.cli import UserError, cli, run_main
 from retarget import retarget, write_bvh
@@ -191,6 +193,11 @@ def test_retarget_any_human(trained, tmp_path, clips, capsys):
     raw = data.read_rig(tmp_path / "b.bvh")
     assert "spine3" in raw.names and len(raw.pos) == len(clips[0])
     assert 0.5 < raw.pos[:, 2].mean() < 1.2 and raw.unit == 0.01
+    if sdk := importlib.util.find_spec("bvhsdk") and importlib.import_module("bvhsdk"):
+        b = bvh.read(tmp_path / "b.bvh")
+        pos, _ = bvh.global_pose(b)
+        for joint in sdk.ReadFile(str(tmp_path / "b.bvh")).getlistofjoints():
+            np.testing.assert_allclose(joint.getPosition(30), pos[30, b.names.index(joint.name)], atol=1e-3)
     assert run("retarget", *files, "--target", "oppy") == 2 and "valid: human, dino" in capsys.readouterr().err
 
 
