@@ -105,8 +105,8 @@ class RetargetOptions:
 
     source: str | None = arg(None, "BVH file to retarget")
     target: str | None = arg(
-        None, "a trained rig, as dino (the source is then any human that mocap reads); or a BVH file of the skeleton "
-        "to move, or A/NUMBER or B/NUMBER: a character of two trained families",
+        None, "a trained rig, as dino, or a BVH file of a body of one (the source is any human that mocap reads); "
+        "or A/NUMBER or B/NUMBER: a character of two trained families",
     )  # fmt: skip
     out: str | None = arg(None, "BVH file to write")
     weights: str | None = arg(
@@ -127,9 +127,11 @@ def retarget(argv) -> int:
     if not opt.source or not opt.target or not (opt.out or opt.png or opt.video):
         raise UserError("give --source FILE.bvh, --target FILE.bvh (or B/0), and --out FILE.bvh, --png or --video")
     check_folders(opt.out, opt.png, opt.video, read=(opt.source, opt.target, opt.weights))
-    if opt.target in rigs.RIGS:
-        return onto_rig(opt)
-    net = Retargeter(opt.weights or SHIPPED)
+    family = opt.target[:2] in ("A/", "B/") or len(opt.target.partition("/")[0]) == 1
+    weights = opt.weights or (SHIPPED if family else correct.SHIPPED)
+    if not Path(weights).is_dir() and "rigs" in load_checkpoint(weights)[1]:
+        return onto_rig(opt, Correction(weights))
+    net = Retargeter(weights)
     patterns = tuple(p for p in opt.drop.split(",") if p)
     up = lambda k: net.domains[k].structure.up  # noqa: E731
 
@@ -169,19 +171,34 @@ def retarget(argv) -> int:
     return 0
 
 
-def onto_rig(opt) -> int:
+def target_body(net: Correction, target, up, drop):
+    """(number of the rig, body) of a rig's name, or of a BVH file that has a trained rig's joints: a static skeleton.
+
+    Raises    UserError: neither
+    Test      tests/skeletal/test_skeletal_correct.py::test_retarget_to_a_static_skeleton
+    """
+    if not target.lower().endswith(".bvh"):
+        return net.index(target), net.sides[net.index(target)].rig.skeleton
+    for k, side in enumerate(net.sides):
+        raw = data.read_rig(target, up, (*drop, *rigs.DROPPED.get(side.rig.name, ())))
+        if set(raw.names) == set(side.names):
+            return k, data.to_motion(raw, side.rig.structure).skeleton
+    known = "; or ".join(f"{s.rig.name}: {', '.join(s.names)}" for s in net.sides)
+    raise UserError(f"{target}: no trained rig has its joints, {', '.join(raw.names)}; valid: {known}")
+
+
+def onto_rig(opt, net: Correction) -> int:
     """A file of any rig that mocap can read, by its canonical human, onto a trained rig or a body of one.
 
     Raises    UserError: a rig that mocap cannot read, or a target that no network was trained for
     Test      tests/skeletal/test_skeletal_correct.py::test_retarget_any_human
     """
-    net = Correction(opt.weights or correct.SHIPPED)
-    to = net.index(opt.target)
+    to, body = target_body(net, opt.target, opt.up, tuple(p for p in opt.drop.split(",") if p))
     clip = rigs.at_30(mocap.data.read_clips([opt.source])[0])
     source = net.index("human")
     m = data.to_motion(rigs.human_raw(clip), net.sides[source].rig.structure)
     B = net.sides[to].rig
-    out, standing = net(m, source, B.skeleton, to), data.contacts(m)
+    out, standing = net(m, source, body, to), data.contacts(m)
     before = data.sliding(out, standing)
     if opt.clean:
         out = data.clean_feet(out, standing)

@@ -201,6 +201,29 @@ def test_retarget_any_human(trained, tmp_path, clips, capsys):
     assert run("retarget", *files, "--target", "oppy") == 2 and "valid: human, dino" in capsys.readouterr().err
 
 
+def test_retarget_to_a_static_skeleton(trained, tmp_path, clips, capsys):
+    """A file of Dino's joints, a fifth longer, is the body that moves; a file of other joints is refused by name."""
+    net = correct.Correction(trained / "correct-0.npz")
+    rig = net.sides[1].rig
+    long = replace(rig.skeleton, offsets=1.2 * rig.skeleton.offsets)
+    still = rigs.put_on(clips[1], rig, rig.skeleton)[:3]
+    s = replace(rig.structure, up="y", unit=0.01)
+    data.write_motion(tmp_path / "t.bvh", replace(still, skeleton=long), s)
+    human = net.sides[0].rig
+    m = data.to_motion(rigs.human_raw(clips[0]), human.structure)
+    data.write_motion(tmp_path / "a.bvh", m, replace(human.structure, up="y", unit=0.01))
+    files = ("--weights", trained / "correct-0.npz", "--source", tmp_path / "a.bvh", "--out", tmp_path / "b.bvh")
+    assert run("retarget", *files, "--target", tmp_path / "t.bvh") == 0 and "-> dino" in capsys.readouterr().out
+    made = data.read_rig(tmp_path / "b.bvh")
+    lengths = np.linalg.norm(made.offsets, axis=1)
+    want = np.linalg.norm(long.offsets, axis=1)[[rig.skeleton.names.index(n) for n in made.names]]
+    np.testing.assert_allclose(lengths, want, atol=1e-5)
+    jesse = character.load("jesse")
+    write_bvh(tmp_path / "j.bvh", jesse, retarget(jesse, clips[0]).qpos, 30.0)
+    assert run("retarget", *files, "--target", tmp_path / "j.bvh") == 2
+    assert "no trained rig has its joints" in capsys.readouterr().err
+
+
 def test_end_error(sides):
     """A hand that is off by its limb's length counts one; the mean is over five ends."""
     m = sides[0].clips[0][1]
