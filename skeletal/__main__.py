@@ -1,4 +1,4 @@
-"""Skeleton-aware networks on the command line: python -m skeletal train | autoencode | retarget | measure."""
+"""Skeleton-aware networks on the command line: python -m skeletal COMMAND (skeletal/play.py)."""
 
 from plumbing.cli import run_main
 from skeletal.play import main

@@ -241,7 +241,7 @@ def read_rig(path, up="y", drop=()) -> Raw:
         child = parents.index(root)  # a dummy above the real root
         local = place[:, child] if child < place.shape[1] else np.broadcast_to(offsets[child], pos.shape)
         pos, q0, root = pos + quat_rotate(q0, local), quat_mul(q0, quat[:, child]), child
-    keep = _kept(names, parents, root, drop)
+    keep = kept_joints(names, parents, root, drop)
     if len(keep) < 3:
         raise UserError(f"{path}: {len(keep) - 1} bones are left; valid: a root and two bones or more")
     at = {j: i for i, j in enumerate(keep)}
@@ -272,7 +272,7 @@ def read_rig(path, up="y", drop=()) -> Raw:
     )
 
 
-def _kept(names, parents, root, drop):
+def kept_joints(names, parents, root, drop):
     """Joints below the root, depth first, without the dropped and what hangs from them."""
     out, stack = [], [root]
     while stack:
@@ -311,14 +311,14 @@ def structure_of(raws, up="y") -> Structure:
                 "valid: one rig a folder"
             )
     q = np.concatenate([r.quat[:: max(len(r.quat) // 60, 1)] for r in raws])
-    ref = np.stack([_mean_quat(q[:, j]) for j in range(q.shape[1])])
+    ref = np.stack([mean_quat(q[:, j]) for j in range(q.shape[1])])
     travel, tilts = 0.0, []
     for r in raws:
         yaw = _twist(quat_mul(r.quat[:, 0], quat_conj(first.quat[0, 0])))
         tilts.append(quat_mul(quat_about(2, -yaw), r.quat[:, 0]))
         v = np.diff(r.pos[:, 0] + 1j * r.pos[:, 1])
         travel = travel + np.sum(v * np.exp(-1j * yaw[1:]))
-    ref[0] = _mean_quat(np.concatenate(tilts))
+    ref[0] = mean_quat(np.concatenate(tilts))
     ahead = travel
     if first.forward is not None:
         f = quat_rotate(ref[0], first.forward)
@@ -332,7 +332,7 @@ def structure_of(raws, up="y") -> Structure:
     return replace(s, feet=tuple(int(e) for e, yes in zip(leaves, low) if yes))
 
 
-def _mean_quat(q):
+def mean_quat(q):
     """The mean rotation of (N, 4): largest eigenvector of sum q q^T, which does not see the sign."""
     return np.linalg.eigh(q.T @ q)[1][:, -1]
 
@@ -342,7 +342,8 @@ def _twist(q):
     return 2.0 * np.arctan2(q[..., 3], q[..., 0])
 
 
-def _references(s: Structure):
+def references(s: Structure):
+    """(J, 4) orientations of the joints in the reference pose, world."""
     g = s.reference.copy()
     for j in range(1, len(g)):
         g[j] = quat_mul(g[s.parents[j]], g[j])
@@ -350,7 +351,7 @@ def _references(s: Structure):
 
 
 def _skeleton(r: Raw, s: Structure) -> Skeleton:
-    g = _references(s)
+    g = references(s)
     offsets = np.zeros_like(r.offsets)
     for j in range(1, len(g)):
         offsets[j] = quat_rotate(g[s.parents[j]], r.offsets[j])
@@ -358,7 +359,7 @@ def _skeleton(r: Raw, s: Structure) -> Skeleton:
 
 
 def _rebased(r: Raw, s: Structure, skeleton: Skeleton) -> Motion:
-    g, quat = _references(s), r.quat.copy()
+    g, quat = references(s), r.quat.copy()
     above = np.array((0, *s.parents[1:]))
     quat[:, 1:] = quat_mul(quat_mul(g[above[1:]], r.quat[:, 1:]), quat_conj(g[1:]))
     quat[:, 0] = quat_mul(r.quat[:, 0], quat_conj(g[0]))
@@ -404,7 +405,7 @@ def write_motion(path, m: Motion, s: Structure):
     Raises    UserError: the folder cannot be written
     Test      tests/skeletal/test_skeletal_data.py::test_any_bvh
     """
-    g = _references(s)
+    g = references(s)
     above = np.array((0, *s.parents[1:]))
     quat = m.quat.copy()
     quat[:, 1:] = quat_mul(quat_mul(quat_conj(g[above[1:]]), m.quat[:, 1:]), g[1:])
@@ -452,7 +453,7 @@ def human_motion(clip: Clip) -> Motion:
     offsets by their mean.  Test: tests/skeletal/test_skeletal_data.py::test_families"""
     names = (*SEGMENTS, "ball_l", "ball_r")
     parents = (*HUMAN_PARENTS, SEGMENTS.index("foot_l"), SEGMENTS.index("foot_r"))
-    order = _kept(names, parents, 0, ())
+    order = kept_joints(names, parents, 0, ())
     place = np.concatenate([clip.pos, clip.ball], axis=1)
     g = np.concatenate([clip.quat, clip.quat[:, [parents[-2], parents[-1]]]], axis=1)
     offsets = np.zeros((len(names), 3))
@@ -640,7 +641,7 @@ def truth(m: Motion, target: Skeleton) -> Motion:
     for leaf in target.graph.leaves:
         name = target.names[leaf]
         chain, chain_s = _limb(target, leaf), _limb(m.skeleton, m.skeleton.names.index(name))
-        if len(chain) < 3:
+        if len(chain) < 3 or len(chain_s) < 2:
             continue  # a neck: nothing to bend
         hand = leaf not in target.feet
         base, base_s = (chain[0], chain_s[0]) if hand else (0, 0)

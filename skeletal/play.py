@@ -2,33 +2,36 @@ r"""Skeleton-aware networks at work: retargeting, measuring, the auto-encoder co
 
     python -m skeletal train       two structures, unpaired: losses [SAN-3] to [SAN-8]
     python -m skeletal autoencode  §4.4: skeletal against plain temporal convolution, both noises
-    python -m skeletal retarget    one BVH onto the skeleton of another
-    python -m skeletal measure     errors beside the copy baselines, before and after the foot clean-up
+    python -m skeletal correct     corrections of copies between any real rigs (skeletal/correct.py)
+    python -m skeletal retarget    one BVH onto the skeleton of another, or any human onto a trained rig
+    python -m skeletal measure     pairs of real rigs, beside copies, inverse kinematics and a constant pose
+    python -m skeletal families    the two families' errors beside the copy baselines
 
-`--help` after any of the four words lists its settings.
+`--help` after any of the words lists its settings.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
-from nn import Adam
-from plumbing import render
-from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli
+import mocap.data
+from plumbing.cli import COUNT, POSITIVE, UserError, arg, cli
 from plumbing.files import atomic_write, check_folders
-from plumbing.runs import Progress, check_run, latest_checkpoint, load_checkpoint, open_run, save_checkpoint, versions
-from skeletal import data
+from plumbing.runs import latest_checkpoint, load_checkpoint, versions
+from skeletal import correct, data, rigs
+from skeletal.autoencode import autoencode
+from skeletal.correct import Correction
 from skeletal.data import Motion, Skeleton
-from skeletal.layers import PLACE, ROOT, fk_forward
-from skeletal.layers import fk_backward as fk_grad
-from skeletal.net import Generator, carry_root, mse
-from skeletal.train import WINDOW, Domain, base_motions, choices_of, domains_from, train
+from skeletal.layers import PLACE, ROOT
+from skeletal.measure import measure
+from skeletal.net import Generator, carry_root
+from skeletal.pictures import draw
+from skeletal.train import base_motions, choices_of, domains_from, train
 
 SHIPPED = Path(__file__).resolve().parent / "skeletal.npz"
 
@@ -101,11 +104,15 @@ class RetargetOptions:
     """One motion onto another skeleton."""
 
     source: str | None = arg(None, "BVH file to retarget")
-    target: str | None = arg(None, "BVH file of the skeleton to move, or A/NUMBER or B/NUMBER: a trained character")
+    target: str | None = arg(
+        None, "a trained rig, as dino, or a BVH file of a body of one (the source is any human that mocap reads); "
+        "or A/NUMBER or B/NUMBER: a character of two trained families",
+    )  # fmt: skip
     out: str | None = arg(None, "BVH file to write")
-    weights: str = arg(
-        str(SHIPPED), "run folder or .npz of python -m skeletal train; default: the shipped one, if any", metavar="FILE"
-    )
+    weights: str | None = arg(
+        None, ".npz of python -m skeletal correct for a rig, else run folder or .npz of python -m skeletal train; "
+        "default: the shipped ones", metavar="FILE",
+    )  # fmt: skip
     up: str = arg("y", "axis of the files that points up", choices=("x", "y", "z", "-x", "-y", "-z"))
     drop: str = arg("", "joints to leave out, as in training")
     clean: bool = arg(True, "foot clean-up")
@@ -120,7 +127,11 @@ def retarget(argv) -> int:
     if not opt.source or not opt.target or not (opt.out or opt.png or opt.video):
         raise UserError("give --source FILE.bvh, --target FILE.bvh (or B/0), and --out FILE.bvh, --png or --video")
     check_folders(opt.out, opt.png, opt.video, read=(opt.source, opt.target, opt.weights))
-    net = Retargeter(opt.weights)
+    family = opt.target[:2] in ("A/", "B/") or len(opt.target.partition("/")[0]) == 1
+    weights = opt.weights or (SHIPPED if family else correct.SHIPPED)
+    if not Path(weights).is_dir() and "rigs" in load_checkpoint(weights)[1]:
+        return onto_rig(opt, Correction(weights))
+    net = Retargeter(weights)
     patterns = tuple(p for p in opt.drop.split(",") if p)
     up = lambda k: net.domains[k].structure.up  # noqa: E731
 
@@ -155,60 +166,59 @@ def retarget(argv) -> int:
     if opt.out:
         data.write_motion(opt.out, out, net.domains[to].structure)
     if opt.png or opt.video:
-        _pictures([m, out], ["source: blue", "retargeted: orange"], opt.png, opt.video, opt.every)
+        draw([m, out], ["source", "retargeted"], opt.png, opt.video, opt.every)
     print(*filter(None, (opt.out, opt.png, opt.video)), sep="\n")
     return 0
 
 
-FLOOR = """<mujoco><visual><headlight ambient=".5 .5 .5"/></visual><asset><texture name="g" type="2d" builtin="checker"
-rgb1=".85 .87 .9" rgb2=".75 .78 .82" width="256" height="256"/><material name="g" texture="g" texrepeat="1 1"
-texuniform="true"/></asset><worldbody><light pos="0 0 5" dir="0 0 -1" directional="true"/><geom type="plane"
-size="60 60 .1" material="g"/></worldbody></mujoco>"""
-COLOURS = ((0.35, 0.6, 0.9, 1), (0.9, 0.5, 0.2, 1), (0.4, 0.75, 0.4, 1), (0.6, 0.6, 0.6, 1))
+def target_body(net: Correction, target, up, drop):
+    """(number of the rig, body) of a rig's name, or of a BVH file that has a trained rig's joints: a static skeleton.
+
+    Raises    UserError: neither
+    Test      tests/skeletal/test_skeletal_correct.py::test_retarget_to_a_static_skeleton
+    """
+    if not target.lower().endswith(".bvh"):
+        return net.index(target), net.sides[net.index(target)].rig.skeleton
+    for k, side in enumerate(net.sides):
+        raw = data.read_rig(target, up, (*drop, *rigs.DROPPED.get(side.rig.name, ())))
+        if set(raw.names) == set(side.names):
+            return k, data.to_motion(raw, side.rig.structure).skeleton
+    known = "; or ".join(f"{s.rig.name}: {', '.join(s.names)}" for s in net.sides)
+    raise UserError(f"{target}: no trained rig has its joints, {', '.join(raw.names)}; valid: {known}")
 
 
-def _pictures(motions, labels, png, video, every):
-    """Stick figures side by side, each on its own line across the walk, followed by the camera."""
-    model = mujoco.MjModel.from_xml_string(FLOOR)
-    physics = mujoco.MjData(model)
-    mujoco.mj_forward(model, physics)
-    poses = [data.pose(m)[0] for m in motions]
-    for i, (p, m) in enumerate(zip(poses, motions)):
-        p -= np.array([*p[0, 0, :2], np.percentile(p[..., 2].min(axis=1), 5)])
-        p *= 1.0 / m.skeleton.leg  # everybody's legs are 1 m long
-        p[..., 1] -= 1.1 * (i - 0.5 * (len(poses) - 1))
-    count = min(map(len, poses))
-    camera = lambda t: _camera(np.mean([p[t, :1] for p in poses], axis=0), 3.2 + 0.6 * len(poses))  # noqa: E731
-    scene = render.Scene(model, 480, 360, camera(0), fast=True)
+def onto_rig(opt, net: Correction) -> int:
+    """A file of any rig that mocap can read, by its canonical human, onto a trained rig or a body of one.
 
-    def frame(t):
-        marks = []
-        for p, m, c in zip(poses, motions, COLOURS):
-            marks += render.stick_figure(p[t], m.skeleton.parents, c, 0.025)
-        return scene.frame(physics, camera(t), marks)
-
-    if png:
-        times = range(0, count, max(round(every * data.RATE), 1))
-        text = [f"{t / data.RATE:.1f} s " + " ".join(labels) for t in times]
-        render.write_png(png, render.contact_sheet([frame(t) for t in times], text, 4))
-    if video:
-        render.write_video(video, (frame(t) for t in range(count)), round(data.RATE))
-    scene.close()
-
-
-def _camera(p, distance):
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = [*p[0, :2], 0.8]
-    camera.distance, camera.azimuth, camera.elevation = distance, 120, -12
-    return camera
+    Raises    UserError: a rig that mocap cannot read, or a target that no network was trained for
+    Test      tests/skeletal/test_skeletal_correct.py::test_retarget_any_human
+    """
+    to, body = target_body(net, opt.target, opt.up, tuple(p for p in opt.drop.split(",") if p))
+    clip = rigs.at_30(mocap.data.read_clips([opt.source])[0])
+    source = net.index("human")
+    m = data.to_motion(rigs.human_raw(clip), net.sides[source].rig.structure)
+    B = net.sides[to].rig
+    out, standing = net(m, source, body, to), data.contacts(m)
+    before = data.sliding(out, standing)
+    if opt.clean:
+        out = data.clean_feet(out, standing)
+    after = data.sliding(out, standing)
+    print(f"{opt.source}: {len(m)} frames, human -> {B.name}; feet slide {100 * before:.1f} cm/s, "
+          f"after the clean-up {100 * after:.1f}; source {100 * data.sliding(m, standing):.1f}")  # fmt: skip
+    if opt.out:
+        data.write_motion(opt.out, out, replace(B.structure, up="y", unit=0.01))
+    if opt.png or opt.video:
+        draw([m, out], ["source", B.name], opt.png, opt.video, opt.every)
+    print(*filter(None, (opt.out, opt.png, opt.video)), sep="\n")
+    return 0
 
 
 # ------------------------------------------------------------------------------------ measuring
 
 
 @dataclass
-class MeasureOptions:
-    """Errors on unseen clips of unseen characters."""
+class FamilyOptions:
+    """Errors of two trained families on unseen clips of unseen characters."""
 
     weights: str = arg(str(SHIPPED), "run folder or .npz of python -m skeletal train; more than one, with commas")
     motion: str = arg("builtin", "folder of the recorded rig's BVH files, or builtin")
@@ -229,9 +239,9 @@ foot clean-up; _pose: joints relative to the root; _ab, _ba: from the first stru
 best of the three copies; slide: mean speed of standing feet [cm/s], retargeted, after the clean-up, and the truth's"""
 
 
-def measure(argv) -> int:
-    """python -m skeletal measure: errors x 1000.  Test: tests/skeletal/test_skeletal_play.py::test_measure_command"""
-    opt = cli(MeasureOptions, argv, "python -m skeletal measure", MeasureOptions.__doc__)
+def families(argv) -> int:
+    """python -m skeletal families: errors x 1000.  Test: tests/skeletal/test_skeletal_play.py::test_measure_command"""
+    opt = cli(FamilyOptions, argv, "python -m skeletal families", FamilyOptions.__doc__)
     check_folders(opt.json, Path(opt.png) / "sheet.png" if opt.png else None)
     nets = {name: Retargeter(name) for name in opt.weights.split(",")}
     cases = held_out(opt, next(iter(nets.values())))
@@ -331,7 +341,7 @@ def sheets(cases, net, opt):
         _, a, m, b, true = cross[i]
         out = data.clean_feet(net(m, a, true.skeleton, b), data.contacts(m))
         path = Path(opt.png) / f"{m.name}-{'AB'[a]}{'AB'[b]}.png"
-        _pictures([m, out, true], ["source", "retargeted", "truth"], path, None, opt.every)
+        draw([m, out, true], ["source", "retargeted", "truth"], path, None, opt.every, (0, 1, 1))
 
 
 def errors(cases, net) -> dict:
@@ -352,125 +362,10 @@ def errors(cases, net) -> dict:
     return {k: float(np.mean(v)) for k, v in sums.items()}
 
 
-# ------------------------------------------------------------------------------------ §4.4: two auto-encoders
-
-
-@dataclass
-class AutoOptions:
-    """§4.4: skeletal against plain temporal convolution, under two noises."""
-
-    motion: str = arg("builtin", "folder of one rig's BVH files, or builtin")
-    clips: str = arg("*", "shell pattern on clip names")
-    drop: str = arg("", "joints to leave out with all below them")
-    up: str = arg("y", "axis of the files that points up", choices=("x", "y", "z", "-x", "-y", "-z"))
-    limit: int = arg(200, "clips at most, evenly chosen", check=COUNT)
-    held: int = arg(20, "held-out clips at most", check=COUNT)
-    out: str | None = arg(None, "run folder; default runs/autoencode")
-    resume: bool = arg(False, "continue: networks that are finished are not trained again")
-    steps: int = arg(600, "optimiser steps a network", check=COUNT)
-    batch: int = arg(16, "windows a step", check=COUNT)
-    lr: float = arg(1e-3, "Adam's learning rate", check=POSITIVE)
-    sigma: float = arg(0.01, "standard deviation of the Gaussian noise on quaternions", check=POSITIVE)
-    zeros: float = arg(0.05, "share of (joint, frame) pairs set to zero", check=NONNEGATIVE)
-    seeds: tuple[int, ...] = arg((0, 1, 2), "one pair of networks each")
-    json: str | None = arg(None, "write the table here")
-
-
-def noisy(x, kind, opt, rng):
-    """A window (T, C) with Gaussian noise on its quaternions, or with random (joint, frame) pairs zeroed  [SAN §4.4].
-
-    Test: tests/skeletal/test_skeletal_play.py::test_noise"""
-    x = x.copy()
-    if kind == "gaussian":
-        x[:, 3:] += opt.sigma * rng.standard_normal(x[:, 3:].shape).astype(x.dtype)
-    elif kind == "zeros":
-        q = x[:, 3:].reshape(len(x), -1, 4)
-        q[rng.random(q.shape[:2]) < opt.zeros] = 0.0
-        x[:, 3:] = q.reshape(len(x), -1)
-    return x
-
-
-def autoencode(argv) -> int:
-    """python -m skeletal autoencode.  Test: tests/skeletal/test_skeletal_play.py::test_autoencode_command"""
-    opt = cli(AutoOptions, argv, "python -m skeletal autoencode", AutoOptions.__doc__)
-    out = Path(opt.out or "runs/autoencode")
-    check_run(out, opt.resume)
-    structure, motions = base_motions(opt, "train", opt.limit)
-    skeleton = motions[0].skeleton
-    domain = Domain([skeleton], [(0, replace(m, skeleton=skeleton)) for m in motions], structure=structure)
-    # One deviation for all quaternions: by its own, a joint that hardly moves would see a zero 50 deviations away.
-    domain.std[:, 3:] = np.sqrt(np.mean(domain.std[:, 3:] ** 2))
-    _, held = base_motions(opt, "validation", opt.held)
-    open_run(out, asdict(opt), opt.resume)
-    table = {}
-    for seed in opt.seeds:
-        for kind in ("skeletal", "plain"):
-            net = Generator(domain.parents, np.random.default_rng([seed, 1]), plain=kind == "plain")
-            path = out / f"{kind}-{seed}.npz"
-            if path.exists():
-                net.theta[:] = load_checkpoint(path)[0]["theta"]
-            else:
-                loss = _fit(net, domain, opt, seed, f"{kind} {seed}")
-                save_checkpoint(path, {"theta": net.theta}, {"loss": loss})
-            for noise in ("clean", "gaussian", "zeros"):
-                table[f"{kind}_{noise}_{seed}"] = 1e3 * _rebuild(net, domain, held, noise, opt, seed)
-            print(
-                "  ".join(f"{n} {table[f'{kind}_{n}_{seed}']:.3f}" for n in ("clean", "gaussian", "zeros")),
-                f"({kind}, seed {seed}, {net.n_params} weights)",
-            )  # noqa: E501
-    for noise in ("clean", "gaussian", "zeros"):
-        row = {k: np.mean([table[f"{k}_{noise}_{s}"] for s in opt.seeds]) for k in ("skeletal", "plain")}
-        table |= {f"{k}_{noise}": float(v) for k, v in row.items()}
-        print(f"{noise:9s} skeletal {row['skeletal']:.3f}  plain {row['plain']:.3f}   ((p - p_true) / height)^2 x 1000")
-    if opt.json:
-        atomic_write(opt.json, json.dumps(table | {"versions": versions()}, indent=2) + "\n")
-    return 0
-
-
-def _fit(net, domain, opt, seed, label):
-    """Train one auto-encoder; the loss is on forward kinematics' positions alone, as in §4.4."""
-    rng, adam = np.random.default_rng([seed, 2]), Adam(net.n_params, opt.lr)
-    progress, recent = Progress(opt.steps, 0, f"steps {label}"), []
-    for step in range(opt.steps):
-        adam.lr = opt.lr * (1.0 - 0.9 * step / opt.steps)
-        x, turn, who = domain.sample(rng, opt.batch)
-        s, off, _, _, mean, std = domain.body(who)
-        _, true, _ = fk_forward(x * std + mean, off, domain.parents, turn)
-        features, static = net.static_forward(s)
-        z, encoded = net.encode_forward(x, features)
-        y, decoded = net.decode_forward(z, features)
-        _, world, kin = fk_forward(y * std + mean, off, domain.parents, turn)
-        loss, dworld = mse(world, true)
-        net.grad[:] = 0.0
-        dz, df2 = net.decode_backward(std * fk_grad(None, 100.0 * dworld, kin), decoded)
-        _, df1 = net.encode_backward(dz, encoded, want_dx=False)
-        net.static_backward(df1, df2, static)
-        adam.step(net.theta, net.grad)
-        recent.append(loss)
-        if (step + 1) % 100 == 0 or step + 1 == opt.steps:
-            progress.update(step + 1, {"loss": f"{np.mean(recent[-100:]):.3g}"})
-    return float(np.mean(recent[-100:]))
-
-
-def _rebuild(net, domain, held, noise, opt, seed):
-    """Mean error of held-out windows whose input is disturbed."""
-    rng, out = np.random.default_rng([seed, 3]), []
-    skeleton, mean, std = domain.characters[0], domain.mean[0], domain.std[0]
-    features, _ = net.static_forward(domain.statics[0][0][:, None])
-    for m in held:
-        x, turn = data.features(replace(m, skeleton=skeleton))
-        for a in range(0, len(x) - WINDOW + 1, WINDOW):
-            part = x[a : a + WINDOW]
-            z, _ = net.encode_forward((((noisy(part, noise, opt, rng) - mean) / std).T[..., None]).copy(), features)
-            y = net.decode_forward(z, features)[0][..., 0].T * std + mean
-            got, true = (data.from_features(v, turn[a : a + WINDOW], skeleton) for v in (y, part))
-            out.append(data.error(got, true))
-    return float(np.mean(out))
-
-
 # ------------------------------------------------------------------------------------ command line
 
-COMMANDS = {"train": train, "autoencode": autoencode, "retarget": retarget, "measure": measure}
+COMMANDS = {"train": train, "correct": correct.correct, "autoencode": autoencode, "retarget": retarget,
+            "measure": measure, "families": families}  # fmt: skip
 
 
 def main(argv=None) -> int:

@@ -453,7 +453,10 @@ ORDER = (  # a module imports only what stands on a line above its own, or in it
     ("characters", "drop", "skeletal", "web"),
     ("extras",),
 )
-BESIDE = {"drop": ("human", "mocap", "nn", "plumbing"), "skeletal": ("human", "mocap", "nn", "plumbing", "retarget")}
+BESIDE = {
+    "drop": ("human", "mocap", "nn", "plumbing"),
+    "skeletal": ("human", "mocap", "nn", "plumbing", "character", "retarget"),
+}
 RANK = {name: k for k, names in enumerate(ORDER) for name in names}
 
 

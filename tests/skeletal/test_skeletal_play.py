@@ -14,7 +14,7 @@ from mocap import bvh
 from mocap import data as motions
 from plumbing.cli import UserError, run_main
 from plumbing.runs import CHECKPOINT, load_checkpoint, read_metrics, save_checkpoint
-from skeletal import data, play, train
+from skeletal import autoencode, data, pictures, play, train
 from skeletal.__main__ import main
 
 
@@ -48,7 +48,7 @@ def test_help(capsys):
     for command in play.COMMANDS:
         assert run(command, "--help") == 0
         assert "default" in capsys.readouterr().out
-    assert run() == 2 and "valid: train, autoencode, retarget, measure" in capsys.readouterr().err
+    assert run() == 2 and "valid: train, correct, autoencode, retarget, measure, families" in capsys.readouterr().err
     assert run("fly") == 2 and "'fly'" in capsys.readouterr().err
 
 
@@ -103,7 +103,7 @@ def test_nothing_read_is_overwritten(trained, tmp_path, capsys):
         assert run("retarget", "--weights", trained / "run", "--source", a, "--target", b, "--out", out) == 2
         assert f"cannot write {out}: it is {why}" in capsys.readouterr().err
     assert a.read_bytes() == before == b.read_bytes() and kept.read_text() == "mine"
-    assert run("measure", "--weights", trained / "run", "--png", tmp_path / "none") == 2
+    assert run("families", "--weights", trained / "run", "--png", tmp_path / "none") == 2
     assert "there is no folder" in (said := capsys.readouterr()).err and "copy" not in said.out
 
 
@@ -183,7 +183,7 @@ def test_retarget_command(trained, tmp_path, capsys):
 def test_pictures(trained, tmp_path):
     m = data.human_motion(CLIPS[0])
     try:
-        play._pictures([m, m], ["a", "b"], tmp_path / "s.png", None, 1.0)
+        pictures.draw([m, m], ["a", "b"], tmp_path / "s.png", None, 1.0)
     except UserError as e:
         pytest.skip(f"no software OpenGL: {e}")
     assert (tmp_path / "s.png").stat().st_size > 5000
@@ -239,7 +239,7 @@ def test_families_are_unpaired(monkeypatch):
 
 def test_measure_command(trained, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(motions, "load", lambda *a, **k: CLIPS[:1])
-    assert run("measure", "--weights", trained / "run", "--json", tmp_path / "m.json") == 0
+    assert run("families", "--weights", trained / "run", "--json", tmp_path / "m.json") == 0
     r = json.loads((tmp_path / "m.json").read_text())
     assert {"cross", "intra", "copy_cross", "copy_intra", "cross_clean", "slide", "slide_clean"} <= set(r)
     assert r["copy_cross"] == min(v["cross"] for v in r["rows"]["copies"].values()) > 0
@@ -284,7 +284,7 @@ def test_shifted_copy(trained):
 def test_sheets(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(motions, "load", lambda *a, **k: CLIPS[:1])
     net = play.Retargeter(trained / "run")
-    opt = play.MeasureOptions(png=str(tmp_path), sheets=1, every=1.0)
+    opt = play.FamilyOptions(png=str(tmp_path), sheets=1, every=1.0)
     try:
         play.sheets(play.held_out(opt, net), net, opt)
     except UserError as e:
@@ -293,15 +293,15 @@ def test_sheets(trained, tmp_path, monkeypatch):
 
 
 def test_noise():
-    opt = play.AutoOptions(zeros=0.25)
+    opt = autoencode.AutoOptions(zeros=0.25)
     x = np.ones((400, 7 + 4 * 4), np.float32)
     r = np.random.default_rng(0)
-    g = play.noisy(x, "gaussian", opt, r) - x
+    g = autoencode.noisy(x, "gaussian", opt, r) - x
     assert g[:, 3:].std() == pytest.approx(0.01, rel=0.05) and not g[:, :3].any()
-    z = play.noisy(x, "zeros", opt, r)
+    z = autoencode.noisy(x, "zeros", opt, r)
     q = z[:, 3:].reshape(400, 5, 4)
     assert np.all((q == 0).all(-1) | (q == 1).all(-1)) and (q == 0).mean() == pytest.approx(0.25, abs=0.04)
-    assert np.array_equal(play.noisy(x, "clean", opt, r), x)
+    assert np.array_equal(autoencode.noisy(x, "clean", opt, r), x)
 
 
 def test_autoencode_command(tmp_path, monkeypatch, capsys):

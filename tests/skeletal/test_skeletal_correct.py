@@ -1,0 +1,260 @@
+"""skeletal/correct.py and skeletal/measure.py: corrections of copies between rigs, and what they gain."""
+
+import importlib.util
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import character
+from mocap import bvh
+from mocap import data as captures
+from plumbing.cli import UserError, cli, run_main
+from retarget import retarget, write_bvh
+from skeletal import correct, data, measure, rigs
+from skeletal.__main__ import main
+
+
+def run(*args):
+    with pytest.raises(SystemExit) as end:
+        run_main(main, [str(a) for a in args])
+    return end.value.code
+
+
+def options(*args):
+    return cli(correct.CorrectOptions, [str(a) for a in args], "correct", "")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def clips():
+    """Six short built-in clips stand for all of them."""
+    kept = [c[:70] for c in captures.builtin_clips() if c.name.startswith("walk")][:6]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(captures, "load", lambda *a, **k: kept)
+        yield kept
+
+
+@pytest.fixture(scope="module")
+def sides(clips):
+    return correct.gather(options("--rigs", "human,dino"))
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, clips):
+    out = tmp_path_factory.mktemp("correct") / "run"
+    assert run("correct", "--rigs", "human,dino", "--steps", 2, "--batch", 2, "--seeds", "0,1", "--out", out) == 0
+    return out
+
+
+def test_gather_is_unpaired(sides):
+    """No clip is on two rigs; people have no anchor, a bent-over Dino has one."""
+    names = [{m.name for _, m in s.clips} for s in sides]
+    assert all(names) and not names[0] & names[1]
+    assert not sides[0].anchor.any() and np.abs(sides[1].anchor).max() > 0.2
+    with pytest.raises(UserError, match="needs captures; give --motion"):
+        correct.gather(options("--rigs", "human,bandai"))
+    with pytest.raises(UserError, match="wolf: no such rig"):
+        correct.gather(options("--rigs", "human,wolf"))
+    with pytest.raises(UserError, match="one rig; valid: two or more"):
+        correct.gather(options("--rigs", "human"))
+
+
+def test_limbs(sides, clips):
+    """A limb's bones add up to the way from shoulder to hand, from hip to ball and from the pelvis to the head."""
+    s = sides[0]
+    m = s.clips[0][1]
+    p = data.pose(m)[0]
+    bones = p - p[:, np.maximum(m.skeleton.parents, 0)]
+    v = np.einsum("ej,tjc->tec", s.limbs, bones)
+    at = {n: j for j, n in enumerate(s.names)}
+    ends = {s.names[e]: k for k, e in enumerate(s.ends)}
+    for end, base in (("hand_l", "upper_arm_l"), ("ball_r", "thigh_r"), ("head", "pelvis")):
+        np.testing.assert_allclose(v[:, ends[end]], p[:, at[end]] - p[:, at[base]], atol=1e-6)
+
+
+def test_starts_at_the_copy(sides):
+    """Before the first step the network is the copy of rotations, and shifted is that in the target's statistics."""
+    tr = correct.Corrector(options("--rigs", "human,dino", "--batch", 2), sides)
+    batch = tr.sample(0, 1)
+    z, _ = tr.nets[0].encode_forward(batch[0], tr.nets[0].static_forward(tr.sides[0].batch(batch[4])[0])[0])
+    r, _ = tr.nets[1].decode_forward(z, tr.nets[1].static_forward(tr.sides[1].batch(batch[5])[0])[0])
+    assert not r.any()
+    kept = tr.copies[0, 1]
+    x = kept.x[0]
+    np.testing.assert_allclose(kept.standardised(x) * sides[1].std + sides[1].mean, x, atol=1e-5)
+    all_shifted = np.concatenate([kept.shifted(x) for x in kept.x])
+    np.testing.assert_allclose(all_shifted[:, 7:].mean(axis=0), 0.0, atol=1e-3)
+
+
+def richardson(f, h=1e-3):
+    """f'(0) to the fourth order."""
+    return (4 * (f(h / 2) - f(-h / 2)) / h - (f(h) - f(-h)) / (2 * h)) / 3
+
+
+def random_bones(side, rng):
+    return rng.standard_normal((len(side.names), 3, 4, 2)), np.abs(rng.standard_normal((len(side.ends), 2))) + 0.5
+
+
+def test_limb_loss_gradient(sides):
+    rng = np.random.default_rng(0)
+    (a, la), (b, lb) = (random_bones(s, rng) for s in sides)
+    loss, d = correct.limb_loss(a, b, *sides, la, lb)
+    way = rng.standard_normal(b.shape)
+    assert np.sum(d * way) == pytest.approx(
+        richardson(lambda e: correct.limb_loss(a, b + e * way, *sides, la, lb)[0]), rel=1e-6
+    )
+    va = np.einsum("ej,jctb->ectb", sides[0].limbs, a) / la[:, None, None]
+    vb = np.einsum("ej,jctb->ectb", sides[1].limbs, b) / lb[:, None, None] - sides[1].anchor[:, :, None, None]
+    assert loss == pytest.approx(np.mean(np.sum((va - vb) ** 2, axis=(0, 1))))
+
+
+def test_stand_loss_gradient():
+    """By the equation, one foot and frame at a time; feet in the air cost nothing."""
+    rng = np.random.default_rng(0)
+    world, standing = rng.standard_normal((5, 3, 6, 2)), (rng.random((2, 6, 2)) < 0.6).astype(float)
+    loss, d = correct.stand_loss(world, [2, 4], standing)
+    slow = 0.0
+    for k, f in enumerate((2, 4)):
+        for t in range(1, 6):
+            for b in range(2):
+                if standing[k, t, b] and standing[k, t - 1, b]:
+                    slow += np.sum((world[f, :2, t, b] - world[f, :2, t - 1, b]) ** 2)
+    assert loss == pytest.approx(slow / 10)
+    way = rng.standard_normal(world.shape)
+    slope = richardson(lambda e: correct.stand_loss(world + e * way, [2, 4], standing)[0])
+    assert np.sum(d * way) == pytest.approx(slope, rel=1e-6)
+    assert correct.stand_loss(world, [2, 4], 0 * standing)[0] == 0.0
+
+
+def test_whole_gradient(sides):
+    """The gradient of all six losses against a difference along a random direction, for both networks."""
+    opt = options("--rigs", "human,dino", "--batch", 1, "--ltc", 2.0, "--adv", 1.0)
+    tr = correct.Corrector(opt, sides, dtype=np.float64)
+    rng = np.random.default_rng(1)
+    for net in tr.nets:
+        net.theta += 0.02 * rng.standard_normal(net.theta.shape)
+        net.grad[:] = 0.0
+    batch = tr.sample(0, 1)
+
+    def total():
+        losses = tr.direction(0, 1, batch)[0]
+        return sum(tr.weights[k] * v for k, v in losses.items())
+
+    total()
+    for net, grad in zip(tr.nets, [net.grad.copy() for net in tr.nets]):
+        start, way = net.theta.copy(), rng.standard_normal(net.theta.shape)
+
+        def at(e, net=net, start=start, way=way):
+            net.theta[:] = start + e * way
+            return total()
+
+        h = 1e-6
+        slope = (at(h) - at(-h)) / (2 * h)
+        net.theta[:] = start
+        assert grad @ way == pytest.approx(slope, rel=2e-3)
+
+
+def test_step_learns(sides):
+    """Twelve steps between human and Dino lower what they are to lower."""
+    tr = correct.Corrector(options("--rigs", "human,dino", "--batch", 4, "--intra", 0.0, "--adv", 0.1), sides)
+    rows = [tr.step() for _ in range(12)]
+    cost = [sum(tr.weights[k] * v for k, v in r.items() if k != "adv") for r in rows]
+    assert np.mean(cost[-3:]) < 0.8 * np.mean(cost[:2])
+
+
+def test_train_ship_use(trained, sides, clips, tmp_path):
+    """A checkpoint says its rigs, licence and curve, and gives the same answers; other files are refused in a line."""
+    net = correct.Correction(trained / "correct-1.npz")
+    assert net.names == ["human", "dino"] and net.meta["licence"] == "MIT" and net.meta["steps"] == 2
+    assert net.meta["curve"][-1]["step"] == 2 and {"limb", "stand", "ee"} <= set(net.meta["curve"][-1])
+    m = sides[0].clips[0][1]
+    got = net(m, 0, net.sides[1].rig.skeleton, 1)
+    assert len(got) == len(m) and got.skeleton.names == sides[1].names
+    np.testing.assert_allclose(got.pos / got.skeleton.leg, m.pos / m.skeleton.leg, atol=1e-5)
+    correct.ship(trained / "correct-1.npz", tmp_path / "small.npz")
+    small = correct.Correction(tmp_path / "small.npz")(m, 0, net.sides[1].rig.skeleton, 1)
+    np.testing.assert_allclose(data.pose(small)[0], data.pose(got)[0], atol=1e-3)
+    with pytest.raises(UserError, match="wolf: not among the trained rigs; valid: human, dino"):
+        net.index("wolf")
+    np.savez(tmp_path / "other.npz", a=1)
+    with pytest.raises(UserError):
+        correct.Correction(tmp_path / "other.npz")
+    assert run("correct", "--rigs", "human,dino", "--steps", 2, "--out", trained) == 2
+
+
+def test_retarget_any_human(trained, tmp_path, clips, capsys):
+    """A Mixamo-like file of a character goes in by its canonical human, Dino's joints come out, y up in centimetres."""
+    jesse = character.load("jesse")
+    write_bvh(tmp_path / "a.bvh", jesse, retarget(jesse, clips[0]).qpos, 30.0, "mixamo")
+    files = ("--weights", trained / "correct-0.npz", "--source", tmp_path / "a.bvh", "--out", tmp_path / "b.bvh")
+    assert run("retarget", *files, "--target", "dino") == 0
+    assert "human -> dino; feet slide" in capsys.readouterr().out
+    raw = data.read_rig(tmp_path / "b.bvh")
+    assert "spine3" in raw.names and len(raw.pos) == len(clips[0])
+    assert 0.5 < raw.pos[:, 2].mean() < 1.2 and raw.unit == 0.01
+    if sdk := importlib.util.find_spec("bvhsdk") and importlib.import_module("bvhsdk"):
+        b = bvh.read(tmp_path / "b.bvh")
+        pos, _ = bvh.global_pose(b)
+        for joint in sdk.ReadFile(str(tmp_path / "b.bvh")).getlistofjoints():
+            np.testing.assert_allclose(joint.getPosition(30), pos[30, b.names.index(joint.name)], atol=1e-3)
+    assert run("retarget", *files, "--target", "oppy") == 2 and "valid: human, dino" in capsys.readouterr().err
+
+
+def test_retarget_to_a_static_skeleton(trained, tmp_path, clips, capsys):
+    """A file of Dino's joints, a fifth longer, is the body that moves; a file of other joints is refused by name."""
+    net = correct.Correction(trained / "correct-0.npz")
+    rig = net.sides[1].rig
+    long = replace(rig.skeleton, offsets=1.2 * rig.skeleton.offsets)
+    still = rigs.put_on(clips[1], rig, rig.skeleton)[:3]
+    s = replace(rig.structure, up="y", unit=0.01)
+    data.write_motion(tmp_path / "t.bvh", replace(still, skeleton=long), s)
+    human = net.sides[0].rig
+    m = data.to_motion(rigs.human_raw(clips[0]), human.structure)
+    data.write_motion(tmp_path / "a.bvh", m, replace(human.structure, up="y", unit=0.01))
+    files = ("--weights", trained / "correct-0.npz", "--source", tmp_path / "a.bvh", "--out", tmp_path / "b.bvh")
+    assert run("retarget", *files, "--target", tmp_path / "t.bvh") == 0 and "-> dino" in capsys.readouterr().out
+    made = data.read_rig(tmp_path / "b.bvh")
+    lengths = np.linalg.norm(made.offsets, axis=1)
+    want = np.linalg.norm(long.offsets, axis=1)[[rig.skeleton.names.index(n) for n in made.names]]
+    np.testing.assert_allclose(lengths, want, atol=1e-5)
+    jesse = character.load("jesse")
+    write_bvh(tmp_path / "j.bvh", jesse, retarget(jesse, clips[0]).qpos, 30.0)
+    assert run("retarget", *files, "--target", tmp_path / "j.bvh") == 2
+    assert "no trained rig has its joints" in capsys.readouterr().err
+
+
+def test_end_error(sides):
+    """A hand that is off by its limb's length counts one; the mean is over five ends."""
+    m = sides[0].clips[0][1]
+    s = sides[0].rig.skeleton
+    e = s.graph.leaves[1]
+    length = sides[0].limbs[1] @ np.linalg.norm(m.skeleton.offsets, axis=1)
+    offsets = m.skeleton.offsets.copy()
+    offsets[e] += length * np.array([0.0, 0.0, 1.0])
+    moved = replace(m, skeleton=replace(m.skeleton, offsets=offsets))
+    assert measure.end_error(moved, m, sides[0].limbs) == pytest.approx(1 / 5)
+    assert measure.end_error(m, m, sides[0].limbs) == 0.0
+
+
+def test_measure(trained, tmp_path, capsys):
+    """The default works on what is built in; two seeds are averaged; truth has no error, the copy has some."""
+    weights = ",".join(str(trained / f"correct-{k}.npz") for k in (0, 1))
+    assert run("measure", "--weights", weights, "--limit", 1, "--json", tmp_path / "m.json") == 0
+    r = json.loads((tmp_path / "m.json").read_text())
+    rows = r["pairs"]["human-dino"]
+    assert set(rows) == set(measure.ROWS) and all(set(v) == set(measure.METRICS) for v in rows.values())
+    assert rows["truth"]["joint"] == rows["truth"]["ee"] == 0.0 < rows["copy"]["joint"]
+    assert rows["mean_pose"]["ee"] > rows["copy"]["ee"]
+    assert rows["network_clean"]["slide_cm_s"] < 0.5 * rows["network"]["slide_cm_s"]
+    each = [s["network"]["ee"] for s in r["seeds"]["human-dino"]]
+    assert len(each) == 2 and rows["network"]["ee"] == pytest.approx(np.mean(each))
+    assert "human-dino" in capsys.readouterr().out
+
+
+def test_rebased(sides):
+    """Against another reference pose the same poses."""
+    m, rig = sides[0].clips[0][1], sides[0].rig
+    other = data.structure_of([rigs.raw_of(m[:20], rig.structure)], "z")
+    again = measure.rebased(measure.rebased(m, rig.structure, other), other, rig.structure)
+    np.testing.assert_allclose(data.pose(again)[0], data.pose(m)[0], atol=1e-9)
