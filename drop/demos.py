@@ -26,6 +26,7 @@ from drop.body import GRAVITY, LENGTHS, RADII, STANDING, STEP, J, N
 from drop.momenta import root_wrench
 from drop.pictures import check_outputs, write_pictures
 from drop.prior import WEIGHTS, ClipPrior, NearestPrior, PoseRange, SwitchPrior, VaePrior, load_networks
+from drop.rising import Rising
 from drop.simulator import Plane, Simulator, Spheres
 from human import Clip, heading, quat_about, quat_mul, quat_rotate
 from mocap import gait
@@ -47,6 +48,7 @@ class Options:
     correction: bool = arg(True, "the soft correction of the root wrench (Eq. 14)")
     contact: bool = arg(True, "the contact energy (Eq. 6)")
     limits: bool = arg(True, "the range-of-motion energy (Eq. 7)")
+    rise: bool = arg(True, "who is down gets up (drop/rising.py)")
     range: str = arg("limits", "range of motion: joint limits, or the pose VAE (Eq. 15)", choices=("limits", "vae"))
     weights: str = arg(str(WEIGHTS), "of the learned priors, for `vae`")
 
@@ -177,7 +179,6 @@ class Stage:
 
     def __init__(self, opt):
         self.opt, self.clips = opt, motions(opt)
-        self._wrench_limits = {}
         self.general, self.limits = None, body.project_range_of_motion if opt.limits else None
         if "vae" in (opt.prior, opt.range):
             motion, pose, meta = load_networks(opt.weights)
@@ -193,28 +194,28 @@ class Stage:
 
     def prior(self, x, quat, at):
         """The prior asked for; a clip's prior follows the clip the take starts from."""
-        return ClipPrior(x, quat, at) if self.opt.prior == "clip" else self.general
+        if self.opt.prior == "clip":
+            return ClipPrior(x, quat, at)
+        return self.general and Rising(self.general, self.opt.rise)
 
-    def wrench_limit(self, name, x, quat):
-        """What a clip needs itself: the 95th percentile of its root wrench, at least drop.simulator.WRENCH_LIMIT.
+    def wrench_limit(self, x):
+        """The root wrench that is left alone in a motion x (T, 22, 3): by how hard its feet strike, not by the clip.
 
-        ASSUMED   the percentile.  A run drawn down to what a walk needs falls in its turns
-        Test: tests/drop/test_drop_demos.py::test_wrench_limit_is_the_motions_own"""
-        if name not in self._wrench_limits:
-            own = np.percentile(root_wrench(x[:240], quat[:240]), 95)
-            self._wrench_limits[name] = max(simulator.WRENCH_LIMIT, float(own))
-        return self._wrench_limits[name]
+        Equation  WRENCH_LIMIT for one body weight on the toes; twice that at RUN or faster, where the ground's force
+                  peaks at 2 to 2.5 weights (Novacheck 1998)
+        Test: tests/drop/test_drop_demos.py::test_wrench_limit_is_physics"""
+        return simulator.WRENCH_LIMIT * (2.0 if pace(x) >= RUN else 1.0)
 
     def start(self, speed, at=60, prior=None, place=None, turn=0.0, **settings):
         """A simulator and its first state: frame `at` of the clip nearest to `speed`, moved to `place` (2,)."""
-        name, x, quat = pick_motion(self.clips, speed)
+        _, x, quat = pick_motion(self.clips, speed)
         at = min(at, len(x) // 2)
         if place is not None:
             spin = quat_about(2, turn - heading(quat[at, 0]))
             pivot = x[at, 0] * [1, 1, 0]
             x = quat_rotate(np.broadcast_to(spin, x.shape[:2] + (4,)), x - pivot) + [*place, 0.0]
             quat = quat_mul(np.broadcast_to(spin, quat.shape), quat)
-        settings.setdefault("wrench_limit", self.wrench_limit(name, x, quat))
+        settings.setdefault("wrench_limit", self.wrench_limit(x))
         o = self.opt
         sim = Simulator(prior or self.prior(x, quat, at), correction=o.correction, contact=o.contact,
                         limits=self.limits, **settings)  # fmt: skip
@@ -422,8 +423,8 @@ LEAD_STIFFNESS, LEAD_LIMIT = 200.0, 40.0  # N/m, N, ASSUMED: the hand that leads
 
 def _follow(stage, rng, speed, led, frames=480):
     sim, state = stage.start(speed)
-    if isinstance(sim.prior, VaePrior):
-        sim.prior = VaePrior(sim.prior.net, spread=0.3)
+    if isinstance(stage.general, VaePrior):
+        sim.prior.prior = VaePrior(stage.general.net, spread=0.3)
     yaw, ahead, reach = heading(state.quat[0]), 0.6 * speed, []
     way = lambda t: yaw + (t * STEP // 4) * np.pi / 2  # noqa: E731
     dot = state.com[:2] + ahead * np.array([np.cos(yaw), np.sin(yaw)])
@@ -677,7 +678,7 @@ def forearm(w, degrees=60.0, restore=True, steps=60):
     """The left forearm swinging from a held elbow: angles (steps + 1,) [rad], largest relative error of the bone.
 
     Test: tests/drop/test_drop_demos.py::test_weights"""
-    sim = Simulator(None, weights=replace(w, constraint=1e5), contact=False, limits=None, restore=restore)
+    sim = Simulator(None, weights=replace(w, constraint=1e5, friction=0.0), contact=False, limits=None, restore=restore)
     rest = np.tile([1.0, 0.0, 0.0, 0.0], (N, 1))
     x, e, k = body.forward_kinematics(body.OFFSETS[0], rest), J["elbow_l"], J["wrist_l"]
     theta = np.radians(degrees)
