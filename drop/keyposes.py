@@ -128,12 +128,12 @@ def on_the_floor(x):
     return x - (x[..., 2] - RADII).min(axis=-1)[..., None, None] * [0, 0, 1]
 
 
-def backflip():
-    r"""A backflip: the keys of `flip`, turned once backwards about the centre of mass while it flies.
+def leap(turns=1.0):
+    r"""A backflip: the keys of `flip`, turned backwards about the centre of mass while it flies; a jump with 0 turns.
 
-    Equation  in flight c(t) = c_0 + v t + g t²/2 with the v that lands it in time, and x = c + R_y(−2π s)(x' − c'), s
-              the minimum-jerk profile [Flash85] of the flight
-    ASSUMED   the keys, and that the turn is spread over the flight as a reach is
+    Equation  in flight c(t) = c_0 + v t + g t²/2 with the v that lands it in time, and x = c + R_y(−2π n s)(x' − c'),
+              n turns, s the time of the flight from 0 to 1
+    ASSUMED   the keys, and that the turn goes evenly over the flight
     Returns   x (T, 22, 3) [m], quat (T, 22, 4)
     Test      tests/drop/test_drop_rising.py::test_backflip
     """
@@ -146,7 +146,7 @@ def backflip():
     path = com.copy()
     path[inside] = first + s[inside, None] * (last - first)
     path[inside, 2] += 0.5 * 9.81 * (b - a) ** 2 * (s * (1 - s))[inside]
-    turn = Rotation.from_euler("y", -2 * np.pi * np.clip(s, 0, 1)[:, None])
+    turn = Rotation.from_euler("y", -2 * np.pi * turns * np.clip(s, 0, 1)[:, None])
     x = path[:, None] + np.einsum("tij,tkj->tki", turn.as_matrix(), x - com[:, None])
     q = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True)
     spun = Rotation.from_quat(np.repeat(turn.as_quat(), quat.shape[1], axis=0)) * q

@@ -26,7 +26,6 @@ from plumbing.files import atomic_write
 
 SEEDS = 8
 MODERATE = 80.0  # N for 0.27 s on the upper body: 21 N s on 22 kg, from which both priors can recover
-FELLING = 300.0  # N for 0.27 s: nobody stays on his feet
 RECOVER = 360  # frames after the push: 12 s
 LIERS = 8  # people pushed over who are not to rise
 LYING = 300  # frames after the push of those who do not rise: 10 s
@@ -98,14 +97,14 @@ def slide(takes):
 def pushed_over(stage, number, frames, rise=True):
     r"""States after a walker has been pushed over, from the end of the push on; None if he did not fall within 2 s.
 
-    Method    FELLING on the upper body for 0.27 s, direction `number` golden angles from straight ahead; the take
+    Method    demos.FELLING on the upper body for 0.27 s, direction `number` golden angles from straight ahead; the take
               begins at another frame of the walk each time
     Args      rise : False takes the getting up out of the prior (where it has one)
     Test      tests/drop/test_drop_score.py::test_pushed_over
     """
     sim, state = stage.start(1.2, at=30 + 7 * number)
     sim.prior.rise = rise
-    force = demos.one_force("spine3", FELLING * _sideways(state, number * np.pi * (3.0 - np.sqrt(5.0))))
+    force = demos.one_force("spine3", demos.FELLING * _sideways(state, number * np.pi * (3.0 - np.sqrt(5.0))))
     rng, states = np.random.default_rng([stage.opt.seed, number]), []
     for t in range(frames + 8):
         state, _ = sim.step(state, force if t < 8 else None, rng=rng)

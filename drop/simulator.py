@@ -404,8 +404,8 @@ class Weights:
     r"""Weights of the energies, in units of M/h² = 900 N/m; of `direction`, whose residual is a momentum, in 1/kg.
 
     inside is E_3's weight while the pose is inside its limits, where p = x: a drag towards the last iterate, at first
-    the prior's mode.  It counts where the prior alone drives (neither v_tar nor pins).  friction and stiction are of a limp
-    body's joints, moving and at rest.
+    the prior's mode.  It counts where the prior alone drives (neither v_tar nor pins).  friction and stiction are of a
+    limp body's joints, moving and at rest.
     ASSUMED   §7 gives 1, 3, 3, 3 without a scale.  REPRODUCE.md has the tables these were chosen from
     """
 

@@ -46,7 +46,7 @@ def test_key_poses(kind, lead):
 
 def test_backflip():
     """Once round backwards; in flight the centre of mass falls freely and nothing touches the floor."""
-    x, quat = keyposes.backflip()
+    x, quat = keyposes.leap()
     up = Rotation.from_quat(quat[:, 0], scalar_first=True).apply([0, 0, 1.0])[:, 2]
     assert up.min() < -0.9 and up[0] > 0.99 and up[-1] > 0.99
     t = np.arange(len(x)) * STEP
@@ -58,6 +58,9 @@ def test_backflip():
     pitch = np.unwrap(np.arctan2(*(x[:, J["neck"]] - x[:, 0])[:, [0, 2]].T))
     assert pitch[-1] - pitch[0] == pytest.approx(-2 * np.pi, abs=0.2)
     np.testing.assert_allclose(np.linalg.norm(body.DIFFERENCE @ x, axis=-1), np.tile(LENGTHS, (len(x), 1)), rtol=1e-6)
+    jump, _ = keyposes.leap(0.0)  # the same without the turn
+    np.testing.assert_allclose(jump.mean(axis=1), x.mean(axis=1), atol=1e-9)
+    assert (jump[:, J["head"], 2] > jump[:, 0, 2]).all()
 
 
 @pytest.mark.parametrize("kind, roll", [("supine", 0.0), ("prone", 0.0), ("supine", 1.2), ("prone", -1.2)])

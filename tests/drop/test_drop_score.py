@@ -57,7 +57,7 @@ def test_pushed_over(stage):
     assert max(np.linalg.norm(s.v, axis=1).max() for s in states[-30:]) < 0.05
     assert not score.stands(states[-1])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(score, "FELLING", 5.0)
+        patch.setattr(demos, "FELLING", 5.0)
         assert score.pushed_over(stage, 1, 100) is None
 
 
