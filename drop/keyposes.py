@@ -67,12 +67,6 @@ def _pitch(degrees):
     return Rotation.from_euler("y", np.asarray(degrees)[:, None], degrees=True).as_matrix()
 
 
-def _limb(base, end, forward, upper, lower):
-    """Rotations of the two bones of a limb and its middle joint; an end out of reach is pointed at."""
-    first, second = gait.two_bone_leg(base, end, forward, upper, lower)
-    return first, second
-
-
 def key_pose_motion(kind, tempo=1.0, lead="l", rate=1.0 / STEP):
     r"""One of RISES, or a flip before it turns, as the character's motion.
 
@@ -100,12 +94,13 @@ def key_pose_motion(kind, tempo=1.0, lead="l", rate=1.0 / STEP):
         hip = hips + rots["pelvis"] @ [0, sign * BODY.hip_half_width, 0]
         ankle = np.stack([ax, 0 * t + sign * SPLIT, az], axis=1)
         front = rots["pelvis"] @ np.array([1.0, 0.06 * sign, 0.0])
-        rots[f"thigh_{side}"], rots[f"shin_{side}"] = _limb(hip, ankle, front, BODY.thigh, BODY.shin)
+        thigh, shin = gait.two_bone_leg(hip, ankle, front, BODY.thigh, BODY.shin)
+        rots[f"thigh_{side}"], rots[f"shin_{side}"] = thigh, shin
         rots[f"foot_{side}"] = _pitch(foot)
         shoulder = chest + rots["chest"] @ (BODY.shoulder * [1, sign, 1])
         wrist = np.stack([wx, sign * wy, wz], axis=1)
         back = rots["chest"] @ np.array([-1.0, 0.5 * sign, 0.0])
-        upper, fore = _limb(shoulder, wrist, back, BODY.upper_arm, BODY.forearm)
+        upper, fore = gait.two_bone_leg(shoulder, wrist, back, BODY.upper_arm, BODY.forearm)
         # an arm's bones bend about −y: the elbow goes back where a knee would go to the front
         rots[f"upper_arm_{side}"], rots[f"forearm_{side}"] = _facing(upper), _facing(fore)
         rots[f"hand_{side}"] = rots[f"forearm_{side}"]
