@@ -110,6 +110,17 @@ _SEGMENT |= {f"{a}_{s}": f"{b}_{s}" for s in "lr" for a, b in (
 _SEGMENT |= {f"collar_{s}": "chest" for s in "lr"}
 
 
+def joint_rotations(quat):
+    """Global rotations (T, 22, 4) of the joints from those of the canonical human's segments (T, 15, 4).
+
+    Test      tests/drop/test_drop.py::test_character_motion"""
+    out = np.empty((len(quat), N, 4))
+    for j, name in enumerate(JOINTS):
+        parts = [quat[:, SEG[s]] for s in _SEGMENT[name].split()]
+        out[:, j] = parts[0] if len(parts) == 1 else quat_slerp(*parts, np.full(len(quat), 0.5))
+    return out
+
+
 def character_motion(clip):
     r"""A canonical Clip as this character's motion.
 
@@ -120,10 +131,7 @@ def character_motion(clip):
     Returns   x (T, 22, 3) [m], quat (T, 22, 4), world frame
     Test      tests/drop/test_drop.py::test_character_motion
     """
-    quat = np.empty((len(clip), N, 4))
-    for j, name in enumerate(JOINTS):
-        parts = [clip.quat[:, SEG[s]] for s in _SEGMENT[name].split()]
-        quat[:, j] = parts[0] if len(parts) == 1 else quat_slerp(*parts, np.full(len(clip), 0.5))
+    quat = joint_rotations(clip.quat)
     legs = [clip.limb(f"thigh_{s}", f"shin_{s}") + clip.limb(f"shin_{s}", f"foot_{s}") for s in "lr"]
     scale = (LENGTHS[J["knee_l"] - 1] + LENGTHS[J["ankle_l"] - 1]) / np.mean(legs)
     above_hips = np.array([0.0, 0.0, -OFFSETS[J["hip_l"], 2]])  # Clip's pelvis is the hips' midpoint
@@ -281,16 +289,13 @@ def _swing_matrix(axis, towards):
     return EYE3 + K + K @ K / (1.0 + cosine)[:, None, None]
 
 
-def project_range_of_motion(x, twist, solved=None):
-    r"""The pose moved back inside the joints' limits.
+def joint_angles(x, twist, solved=None):
+    r"""Swing about two axes and twist of each limited joint: what LIMITS bound.
 
-    Equation  [DROP Eq. 7] x_r; here each joint's swing and twist is clipped to LIMITS, then forward kinematics, laid
-              on x as a rigid body (`align`): the nearest place, and the one whose pull has no net force or torque
-    Departs   §7 projects with a pose VAE (Eq. 15, VPoser), which is not to be had here; `limits` of `Simulator` takes
-              any other projection of this form
+    Equation  swing vector (`swing`) on BASIS; twist as the prior's sample has it, of spine3 what its three bones say
     Args      x : (22, 3); twist : what `twists` returns; solved : swing_twist(x, twist), if it is known already
-    Returns   (22, 3): x itself if the pose is inside
-    Test      tests/drop/test_drop.py::test_projections_are_nearest_and_idempotent, ::test_range_of_motion
+    Returns   (22, 3) [rad]
+    Test      tests/drop/test_drop.py::test_range_of_motion
     """
     R, u = solved or swing_twist(x, twist)
     local = np.empty((N, 3))
@@ -299,7 +304,24 @@ def project_range_of_motion(x, twist, solved=None):
     local[:, 2] = twist[0]
     spine = _swing_matrix(AXIS[9:10], u[9:10])[0].T @ R[6].T @ R[9]  # what is left is a turn about the axis
     local[9, 2] = np.arctan2(0.5 * np.sum((AXIS[9] @ SKEW).reshape(3, 3) * spine), 0.5 * (np.trace(spine) - 1.0))
-    clipped = np.minimum(np.maximum(local, LOW), HIGH)
+    return local
+
+
+def project_range_of_motion(x, twist, solved=None, low=LOW, high=HIGH):
+    r"""The pose moved back inside the joints' limits.
+
+    Equation  [DROP Eq. 7] x_r; here each joint's swing and twist is clipped to LIMITS, then forward kinematics, laid
+              on x as a rigid body (`align`): the nearest place, and the one whose pull has no net force or torque
+    Departs   §7 projects with a pose VAE (Eq. 15, VPoser), which is not to be had here; `limits` of `Simulator` takes
+              any other projection of this form
+    Args      x : (22, 3); twist : what `twists` returns; solved : swing_twist(x, twist), if it is known already;
+              low, high : (22, 3) [rad] other limits
+    Returns   (22, 3): x itself if the pose is inside
+    Test      tests/drop/test_drop.py::test_projections_are_nearest_and_idempotent, ::test_range_of_motion
+    """
+    solved = R, _ = solved or swing_twist(x, twist)
+    local = joint_angles(x, twist, solved)
+    clipped = np.minimum(np.maximum(local, low), high)
     if np.abs(clipped - local)[LIMITED].max() < 1e-9:
         return x
     R = R.copy()

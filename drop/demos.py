@@ -21,11 +21,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from drop import body, simulator
+from drop import body, keyposes, simulator
 from drop.body import GRAVITY, LENGTHS, RADII, STANDING, STEP, J, N
 from drop.momenta import root_wrench
 from drop.pictures import check_outputs, write_pictures
 from drop.prior import WEIGHTS, ClipPrior, NearestPrior, PoseRange, SwitchPrior, VaePrior, load_networks
+from drop.rising import Rising
 from drop.simulator import Plane, Simulator, Spheres
 from human import Clip, heading, quat_about, quat_mul, quat_rotate
 from mocap import gait
@@ -47,6 +48,7 @@ class Options:
     correction: bool = arg(True, "the soft correction of the root wrench (Eq. 14)")
     contact: bool = arg(True, "the contact energy (Eq. 6)")
     limits: bool = arg(True, "the range-of-motion energy (Eq. 7)")
+    rise: bool = arg(True, "who is down gets up (drop/rising.py)")
     range: str = arg("limits", "range of motion: joint limits, or the pose VAE (Eq. 15)", choices=("limits", "vae"))
     weights: str = arg(str(WEIGHTS), "of the learned priors, for `vae`")
 
@@ -177,7 +179,6 @@ class Stage:
 
     def __init__(self, opt):
         self.opt, self.clips = opt, motions(opt)
-        self._wrench_limits = {}
         self.general, self.limits = None, body.project_range_of_motion if opt.limits else None
         if "vae" in (opt.prior, opt.range):
             motion, pose, meta = load_networks(opt.weights)
@@ -193,28 +194,28 @@ class Stage:
 
     def prior(self, x, quat, at):
         """The prior asked for; a clip's prior follows the clip the take starts from."""
-        return ClipPrior(x, quat, at) if self.opt.prior == "clip" else self.general
+        if self.opt.prior == "clip":
+            return ClipPrior(x, quat, at)
+        return self.general and Rising(self.general, self.opt.rise)
 
-    def wrench_limit(self, name, x, quat):
-        """What a clip needs itself: the 95th percentile of its root wrench, at least drop.simulator.WRENCH_LIMIT.
+    def wrench_limit(self, x):
+        """The root wrench that is left alone in a motion x (T, 22, 3): by how hard its feet strike, not by the clip.
 
-        ASSUMED   the percentile.  A run drawn down to what a walk needs falls in its turns
-        Test: tests/drop/test_drop_demos.py::test_wrench_limit_is_the_motions_own"""
-        if name not in self._wrench_limits:
-            own = np.percentile(root_wrench(x[:240], quat[:240]), 95)
-            self._wrench_limits[name] = max(simulator.WRENCH_LIMIT, float(own))
-        return self._wrench_limits[name]
+        Equation  WRENCH_LIMIT for one body weight on the toes; twice that at RUN or faster, where the ground's force
+                  peaks at 2 to 2.5 weights (Novacheck 1998)
+        Test: tests/drop/test_drop_demos.py::test_wrench_limit_is_physics"""
+        return simulator.WRENCH_LIMIT * (2.0 if pace(x) >= RUN else 1.0)
 
     def start(self, speed, at=60, prior=None, place=None, turn=0.0, **settings):
         """A simulator and its first state: frame `at` of the clip nearest to `speed`, moved to `place` (2,)."""
-        name, x, quat = pick_motion(self.clips, speed)
+        _, x, quat = pick_motion(self.clips, speed)
         at = min(at, len(x) // 2)
         if place is not None:
             spin = quat_about(2, turn - heading(quat[at, 0]))
             pivot = x[at, 0] * [1, 1, 0]
             x = quat_rotate(np.broadcast_to(spin, x.shape[:2] + (4,)), x - pivot) + [*place, 0.0]
             quat = quat_mul(np.broadcast_to(spin, quat.shape), quat)
-        settings.setdefault("wrench_limit", self.wrench_limit(name, x, quat))
+        settings.setdefault("wrench_limit", self.wrench_limit(x))
         o = self.opt
         sim = Simulator(prior or self.prior(x, quat, at), correction=o.correction, contact=o.contact,
                         limits=self.limits, **settings)  # fmt: skip
@@ -246,6 +247,7 @@ def one_force(joint, vector):
 # ------------------------------------------------------------------------------------ the demonstrations
 
 PUSH_FRAMES = (30, 38)  # a push lasts 0.27 s
+FELLING = 300.0  # N for as long: nobody stays on his feet
 RUN = 1.9  # m/s, where people of this size begin to run
 PUSHES = {"torso": ("spine3", 40.0, 200.0), "hand": ("wrist_l", 30.0, 120.0), "foot": ("ankle_l", 40.0, 160.0)}  # [N]
 
@@ -271,6 +273,11 @@ def push(stage, rng):
                 take.notes["away from the unpushed take"] = _displacement(take, undisturbed)
                 take.notes["impulse"] = f"{newton * np.diff(PUSH_FRAMES)[0] * STEP:.0f} N s on {N} kg"
                 takes.append(take)
+    sim, state = stage.start(1.2)
+    left = quat_rotate(quat_about(2, heading(state.quat[0])), np.array([0.0, FELLING, 0.0]))
+    take = single(f"walk pushed over {FELLING:.0f} N", sim, state, 300, stage.again(), pushing("spine3", left))
+    take.window = (30, 299)
+    takes.append(take)
     return takes
 
 
@@ -377,9 +384,12 @@ def projectiles(stage, rng):
 
         take = single("projectiles" + (" dodging" if dodge else ""), sim, state, 210, rng, act)
         take.notes["balls that hit"] = f"{len(seen)} of {len(balls)}"
-        size = [max((np.linalg.norm(f) for _, f in arrows), default=0.0) for arrows in take.arrows]
-        hit = int(np.argmax(size)) if seen else 40  # the sheet: every other frame around the hardest hit
-        take.window = (max(hit - 4, 0), min(hit + 12, len(size) - 1))
+        near = [min((np.linalg.norm(p - s[0].com) for p, _, _ in balls if p[2] > 0.4), default=9.0)
+                for s, balls in zip(take.states, take.balls)]  # fmt: skip
+        nearest = int(np.argmin(near))  # the sheet: every other frame around the ball that comes nearest
+        take.window = (max(nearest - 8, 0), min(nearest + 8, len(near) - 1))
+        size = np.array([o[0].wrench for o in take.outcomes])
+        take.notes["root wrench"] = f"median {np.median(size):.0f}, 95 % {np.percentile(size, 95):.0f}"
         takes.append(take)
     return takes
 
@@ -413,17 +423,18 @@ def follow(stage, rng):
     ASSUMED   v_tar points at the dot; its size is the dot's speed times the distance over 0.6 s of way, at most 1.25
     Test      tests/drop/test_drop_demos.py::test_follower_keeps_the_speed
     """
-    takes = ((1.2, False), (2.5, False), (1.2, True), (2.5, True))
-    return [_follow(stage, stage.again(), speed, led) for speed, led in takes]
+    takes = ((1.2, False, 1.2), (2.5, False, 1.2), (2.5, False, 2.5), (1.2, True, 1.2), (2.5, True, 2.5))
+    return [_follow(stage, stage.again(), speed, led, begin) for speed, led, begin in takes]
 
 
 LEAD_STIFFNESS, LEAD_LIMIT = 200.0, 40.0  # N/m, N, ASSUMED: the hand that leads
 
 
-def _follow(stage, rng, speed, led, frames=480):
-    sim, state = stage.start(speed)
-    if isinstance(sim.prior, VaePrior):
-        sim.prior = VaePrior(sim.prior.net, spread=0.3)
+def _follow(stage, rng, speed, led, begin, frames=480):
+    limit = simulator.WRENCH_LIMIT * (2.0 if speed >= RUN else 1.0)
+    sim, state = stage.start(begin, wrench_limit=limit)
+    if isinstance(stage.general, VaePrior):
+        sim.prior.prior = VaePrior(stage.general.net, spread=0.3)
     yaw, ahead, reach = heading(state.quat[0]), 0.6 * speed, []
     way = lambda t: yaw + (t * STEP // 4) * np.pi / 2  # noqa: E731
     dot = state.com[:2] + ahead * np.array([np.cos(yaw), np.sin(yaw)])
@@ -442,7 +453,11 @@ def _follow(stage, rng, speed, led, frames=480):
             reach.append(np.linalg.norm(place - state.x[J["wrist_r"]]))
         return force, {"v_tar": v}, [(np.append(dot, 0.06), 0.06, (0.9, 0.1, 0.1, 1))]
 
-    take = single(f"follow {speed} m/s" + (" led by the hand" if led else ""), sim, state, frames, rng, act)
+    how = f" from {begin} m/s" * (begin != speed) + " led by the hand" * led
+    take = single(f"follow {speed} m/s{how}", sim, state, frames, rng, act)
+    take.window = (90, 180)  # before and after the first turn
+    flies = [o[0].active[body.FEET].sum() == 0 for o in take.outcomes[frames // 2 :]]
+    take.notes["both feet off the floor"] = f"in {100 * np.mean(flies):.0f} % of the second half's frames"
     com = np.array([s[0].com[:2] for s in take.states])
     face = np.array([heading(s[0].quat[0]) for s in take.states])[1:]
     v, t = np.diff(com, axis=0) / STEP, np.arange(1, frames)
@@ -589,30 +604,31 @@ def ragdoll(stage, rng):
 
 
 def backflip(stage, rng):
-    """§8.1: a clip that turns upside down is tracked until a push, then the prior takes over."""
+    """§8.1: a clip that turns upside down is tracked until a push, then the prior takes over.
+
+    Without one among the clips it is the built-in one of drop/keyposes.py."""
     for name, x, quat in stage.clips:  # noqa: B007 (used after the loop)
         up = quat_rotate(quat[:, 0], np.broadcast_to([0.0, 0.0, 1.0], (len(quat), 3)))[:, 2]
         if up.min() < -0.5:
             break
     else:
-        raise UserError(
-            f"backflip: none of the {len(stage.clips)} clips of {stage.opt.motion} turns upside down; give --motion a "
-            "file with a flip in it (CMU's subjects 88 and 90 have some)"
-        )
+        name, (x, quat) = "built in", keyposes.leap()
+        up = quat_rotate(quat[:, 0], np.broadcast_to([0.0, 0.0, 1.0], (len(quat), 3)))[:, 2]
     landing = int(np.flatnonzero(up < -0.5)[-1])
     first, at = max(landing - 45, 1), min(landing + 12, len(x) - 2)
     onset = at - first
-    after = stage.general or ClipPrior(x, quat, first)
+    after = stage.prior(x, quat, first) or ClipPrior(x, quat, first)
     sim, _ = stage.start(0.0, prior=SwitchPrior(ClipPrior(x, quat, first), after, onset))
     state = sim.begin(x[first], quat[first], (x[first] - x[first - 1]) / STEP)
     act = pushing("spine3", np.array([0.0, 60.0, 0.0]), (onset, onset + 8))
-    take = single(f"backflip {name}", sim, state, onset + 90, rng, act)
+    take = single(f"backflip {name}", sim, state, onset + 240, rng, act)
+    take.window = (onset - 40, onset + 200)
     return [take]
 
 
 def wrench(stage, rng):
     """§8.5, Fig. 7: the root wrench of the clips, points and cylinders; of a pushed run, corrected or not."""
-    for name, x, quat in stage.clips[:12]:
+    for name, x, quat in (*stage.clips[:12], ("built-in jump", *keyposes.leap(0.0))):
         a, b = (root_wrench(x[:240], quat[:240], c) for c in (False, True))
         print(
             f"{name:24s} {pace(x):4.2f} m/s  points: median {np.median(a):5.1f}, 95 % {np.percentile(a, 95):5.1f}   "
@@ -677,7 +693,7 @@ def forearm(w, degrees=60.0, restore=True, steps=60):
     """The left forearm swinging from a held elbow: angles (steps + 1,) [rad], largest relative error of the bone.
 
     Test: tests/drop/test_drop_demos.py::test_weights"""
-    sim = Simulator(None, weights=replace(w, constraint=1e5), contact=False, limits=None, restore=restore)
+    sim = Simulator(None, weights=replace(w, constraint=1e5, friction=0.0), contact=False, limits=None, restore=restore)
     rest = np.tile([1.0, 0.0, 0.0, 0.0], (N, 1))
     x, e, k = body.forward_kinematics(body.OFFSETS[0], rest), J["elbow_l"], J["wrist_l"]
     theta = np.radians(degrees)
@@ -722,12 +738,6 @@ def main(argv, others=()):
     stage, takes = Stage(opt), []
     print(f"{len(stage.clips)} clips, {sum(len(c[1]) for c in stage.clips) * STEP / 60:.1f} min; prior {opt.prior}")
     for each in DEMOS if name == "all" else [name]:
-        if name == "all" and each == "backflip":
-            try:
-                takes += backflip(stage, np.random.default_rng(opt.seed))
-            except UserError as none:
-                print(none)
-            continue
         takes += DEMOS[each](stage, np.random.default_rng(opt.seed))
     for take in takes:
         print(report(take))

@@ -23,10 +23,12 @@ import numpy as np
 
 from drop import vae
 from drop.body import (
+    FEET,
     LENGTHS,
     OFFSETS,
     PARENTS,
     PATH,
+    RADII,
     STANDING,
     STEP,
     J,
@@ -40,6 +42,7 @@ from human import heading, quat_conj, quat_mul
 from plumbing.cli import UserError
 from plumbing.runs import load_checkpoint
 
+DOWN = 0.6  # ASSUMED: share of the standing pelvis's height below which a body is down
 WEIGHTS = Path(__file__).resolve().parent / "drop.npz"
 
 
@@ -110,15 +113,16 @@ class NearestPrior:
                  floor=None):  # fmt: skip
         self.tau, self.beta, self.beta_height, self.reach = tau, beta, beta_height, reach
         self.spread, self.floor = spread, floor
-        features, before, after, q0, q1 = [], [], [], [], []
+        features, before, after, q0, q1, held = [], [], [], [], [], []
         for x, quat in clips:
             if len(x) < 3:
                 continue
             features.append(self.features(x[1:-1], (x[1:-1] - x[:-2]) / STEP, quat[1:-1]))
             before.append(x[1:-1, 0]), after.append(x[2:, 0]), q0.append(quat[1:-1]), q1.append(quat[2:])
+            held.append(contacts_of(x)[2:])
         if not features:
             raise ValueError("NearestPrior: no clip has three frames or more")
-        self.x0, self.x1, q0, self.q1 = map(np.concatenate, (before, after, q0, q1))
+        self.x0, self.x1, q0, self.q1, self.held = map(np.concatenate, (before, after, q0, q1, held))
         self.yaw, self.change = heading(q0[:, 0]), quat_mul(quat_conj(q0), self.q1)
         f = np.concatenate(features)
         self.mean = f.mean(axis=0)
@@ -184,7 +188,7 @@ class NearestPrior:
             state.x[0, 1] + s * travel[:, 0] + c * travel[:, 1],
             self.x1[pick, 2] + (1.0 - self.beta_height) * (state.x[0, 2] - ground - self.x0[pick, 2]) + ground,
         ], axis=1)  # fmt: skip
-        return forward_kinematics(root, quat), quat
+        return plant(state.x, forward_kinematics(root, quat), self.held[pick], ground), quat
 
     def sample(self, state, n, rng):
         """n of the 2 n nearest transitions, drawn without replacement; without rng the n nearest."""
@@ -232,8 +236,8 @@ class VaePrior:
     r"""The conditional VAE of drop/vae.py as a prior  [DROP Eqs. 8, 9].
 
     Equation  z ~ N(μ0(s), σ0(s)²) for the set of samples, z = μ0(s) for the mode; x̃ by forward kinematics of the
-              decoded rotations; on a slope the network is shown the state on the level (`level_state`), and its
-              answer goes back on the slope (`incline`)
+              decoded rotations; feet that it says stand are planted (`plant`); on a slope the network is shown the
+              state on the level (`level_state`), and its answer goes back on the slope (`incline`)
     Args      net : drop.vae.MotionVAE; floor : Plane under the character or None; velocity : "own" (§7: what the prior
               itself predicted) or "solved" (differences of the solved positions); spread : standard deviation of the
               angle [rad] by which samples, not the mode, are turned about the pelvis, as NearestPrior's are; down :
@@ -244,7 +248,7 @@ class VaePrior:
     Test      tests/drop/test_drop_vae.py::test_vae_prior
     """
 
-    def __init__(self, net, floor=None, velocity="own", spread=0.0, down=0.6):
+    def __init__(self, net, floor=None, velocity="own", spread=0.0, down=DOWN):
         if velocity not in ("own", "solved"):
             raise ValueError(f"velocity {velocity!r}: valid are own, solved")
         self.net, self.floor, self.velocity, self.spread, self.down = net, floor, velocity, spread, down
@@ -252,8 +256,7 @@ class VaePrior:
 
     def sample(self, state, n, rng):
         """n samples; without rng the mode alone; of a body that is down none."""
-        height, trunk = state.x[0, 2] - ground(self.floor, state.x), state.x[J["neck"], 2] - state.x[0, 2]
-        if height < self.down * STANDING or (trunk < 0.0 and self.down):
+        if down(self.floor, state, self.down):
             return np.zeros((0, N, 3)), np.zeros((0, N, 4))
         return self._decoded(state, n, rng)
 
@@ -271,7 +274,7 @@ class VaePrior:
         z = np.repeat(mu, 1 + (n if rng is not None else 0), axis=0)
         if rng is not None:
             z[1:] += np.exp(log_std) * rng.standard_normal((n, net.latent)).astype(np.float32)
-        out, C = net.decode(np.repeat(s, len(z), axis=0), z, x[0, 0, 2], columns)
+        out, C, logits = net.decode(np.repeat(s, len(z), axis=0), z, x[0, 0, 2], columns)
         angle = np.full(len(z), np.arctan2(frame[1][0], frame[0][0]), float)
         if rng is not None and self.spread:
             angle[1:] += rng.normal(0.0, self.spread, n)
@@ -284,6 +287,7 @@ class VaePrior:
         root = np.matmul(spin, out[:, 0, :, None].astype(float))[..., 0] + state.x[0] * [1, 1, 0] + lift
         quat = vae.quat_of(R)
         found = root[:, None] + PATH @ bones
+        found = plant(state.x, found, logits > 0.0, lift[2])
         if inclined:
             found = incline(self.floor, found)
         self._mode = given, found[0], quat[0]
@@ -348,6 +352,9 @@ class PoseRange:
         return out @ align(out[None], (x - centre)[None])[0].T + centre
 
 
+SLOW = 0.5  # m/s, ASSUMED: a foot in a recording that is slower stands
+# m, ASSUMED: how near a foot must be to be planted, how far it may be put back in a frame, how high a foot swings
+TOUCH, MOST, CLEAR = 0.03, 0.06, 0.01
 LEGS = np.array([[J[f"{name}_{side}"] for side in "lr"] for name in ("hip", "knee", "ankle", "foot")])
 
 
@@ -364,19 +371,32 @@ def incline(floor, x, down=False):
     Test      tests/drop/test_drop.py::test_incline
     """
     sign, out = (-1.0 if down else 1.0), x.copy()
-    dot = lambda a, b: np.einsum("...i,...i", a, b)[..., None]  # noqa: E731
-    unit = lambda a: a / np.maximum(np.sqrt(dot(a, a)), 1e-9)  # noqa: E731
-    l1, l2, l3 = (LENGTHS[row - 1][:, None] for row in LEGS[1:])  # (2, 1), left and right
     rise = (x[..., :1, :2] - x[..., :2]) @ floor.normal[:2] / floor.normal[2]
     low = np.minimum(rise[..., LEGS[2]].min(axis=-1), 0.0)[..., None]
     out[..., 2] += sign * (ground(floor, x)[..., None] + low)
-    hip, knee, ankle, foot = (x[..., row, :] for row in LEGS)
+    hip, ankle, foot = (x[..., row, :] for row in LEGS[[0, 2, 3]])
     leg, bone = ankle - hip, foot - ankle
-    u, v = unit(leg), leg.copy()
-    v[..., 2] += sign * (rise[..., LEGS[2]] - low)
+    leg[..., 2] += sign * (rise[..., LEGS[2]] - low)
     bone[..., 2] += sign * (rise[..., LEGS[3]] - rise[..., LEGS[2]])
-    bone = l3 * unit(bone)
-    reach, v = np.clip(np.sqrt(dot(v, v)), abs(l1 - l2) + 1e-6, l1 + l2 - 1e-6), unit(v)
+    return bent_legs(x, out, leg, bone)
+
+
+def bent_legs(x, out, leg, bone):
+    r"""Other places for ankles and feet: the knees bend so that bones keep their lengths.
+
+    Equation  the knee bends in the plane it had in x, turned with the line from hip to ankle, by the law of cosines; an
+              ankle out of reach is pointed at
+    Args      x : (..., 22, 3) [m] as it was; out : the same with its hips where they shall be, changed in place; leg :
+              (..., 2, 3) wanted from hip to ankle; bone : (..., 2, 3) from ankle to foot, of any length
+    Returns   out
+    Test      tests/drop/test_drop.py::test_incline, ::test_plant
+    """
+    dot = lambda a, b: np.einsum("...i,...i", a, b)[..., None]  # noqa: E731
+    unit = lambda a: a / np.maximum(np.sqrt(dot(a, a)), 1e-9)  # noqa: E731
+    l1, l2, l3 = (LENGTHS[row - 1][:, None] for row in LEGS[1:])  # (2, 1), left and right
+    hip, knee, ankle, foot = (x[..., row, :] for row in LEGS)
+    u = unit(ankle - hip)
+    reach, v = np.clip(np.sqrt(dot(leg, leg)), abs(l1 - l2) + 1e-6, l1 + l2 - 1e-6), unit(leg)
     side = knee - hip + 0.01 * unit(foot - ankle)  # a straight knee bends towards the toes
     side = side - dot(side, u) * u
     side = unit(side - dot(side, v) / np.maximum(1.0 + dot(u, v), 1e-9) * (u + v))  # turned as u to v
@@ -384,8 +404,50 @@ def incline(floor, x, down=False):
     hip = out[..., LEGS[0], :]
     out[..., LEGS[1], :] = hip + l1 * (cosine * v + np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0)) * side)
     out[..., LEGS[2], :] = hip + reach * v
-    out[..., LEGS[3], :] = hip + reach * v + bone
+    out[..., LEGS[3], :] = hip + reach * v + l3 * unit(bone)
     return out
+
+
+def contacts_of(x):
+    r"""Which ankles and balls of the feet stand on the floor in a recording, frame by frame.
+
+    Equation  nearer than TOUCH before and after the step to this frame, and horizontally slower than SLOW in it
+    Args      x : (T, 22, 3) on a floor at z = 0
+    Returns   (T, 4) bool of FEET; the first frame's are the second's
+    Test      tests/drop/test_drop.py::test_plant
+    """
+    near = x[:, FEET, 2] - RADII[FEET] < TOUCH
+    slow = np.linalg.norm(np.diff(x[:, FEET, :2], axis=0), axis=-1) < SLOW * STEP
+    held = near[1:] & near[:-1] & slow
+    return np.concatenate([held[:1], held])
+
+
+def plant(x_t, x, contacts, floor=0.0):
+    r"""Samples whose feet stay where they stand: what the prior calls in contact does not move along the floor.
+
+    Equation  of each foot that touches the floor in x_t (its sphere nearer than TOUCH): if the ball is in contact, the
+              foot is moved horizontally until its ball is where it was in x_t; else, if the ankle is, until its ankle
+              is; what is not in contact clears the floor by CLEAR; the knee bends (`bent_legs`)
+    ASSUMED   HuMoR predicts contacts and uses them when it fits motion, not when it rolls out; so a sample's feet slide
+              by what the network errs, and its swinging feet graze the floor as the recordings' do.  TOUCH, CLEAR; no
+              foot is moved by more than MOST at once
+    Args      x_t : (22, 3) the current state; x : (m, 22, 3) samples; contacts : (m, 4) bool of FEET (ankle and ball,
+              left, then right); floor : height of the level floor [m]
+    Returns   (m, 22, 3)
+    Test      tests/drop/test_drop.py::test_plant
+    """
+    touches = x_t[FEET, 2] - RADII[FEET] - floor < TOUCH
+    held = (contacts & touches).reshape(-1, 2, 2)  # sample, side, ankle or ball
+    drift = (x_t[FEET] - x[:, FEET]).reshape(-1, 2, 2, 3) * [1, 1, 0]
+    shift = np.where(held[..., 1:], drift[:, :, 1], np.where(held[..., :1], drift[:, :, 0], 0.0))
+    shift *= np.minimum(1.0, MOST / np.maximum(np.linalg.norm(shift, axis=-1, keepdims=True), 1e-9))
+    gap = x[:, FEET, 2] - RADII[FEET] - floor
+    lift = np.where(contacts, 0.0, np.clip(CLEAR - gap, 0.0, MOST)).reshape(-1, 2, 2)
+    hip, ankle, foot = (x[:, row] for row in LEGS[[0, 2, 3]])
+    leg, bone = ankle + shift - hip, foot - ankle
+    leg[..., 2] += lift[..., 0]
+    bone[..., 2] += lift[..., 1] - lift[..., 0]
+    return bent_legs(x, x.copy(), leg, bone)
 
 
 def level_state(floor, state):
@@ -401,6 +463,14 @@ def level_state(floor, state):
         for u in (state.v, state.v_own)
     )
     return replace(state, x=x, v=v, v_own=own, quat=vae.quat_of(swing_twist(x, twists(state.quat))[0]))
+
+
+def down(floor, state, share=DOWN):
+    """Is the pelvis below a share of its standing height over the floor, or the neck below the pelvis?  0 : never.
+
+    Test: tests/drop/test_drop_vae.py::test_vae_prior"""
+    height, trunk = state.x[0, 2] - ground(floor, state.x), state.x[J["neck"], 2] - state.x[0, 2]
+    return bool(share and (height < share * STANDING or trunk < 0.0))
 
 
 def ground(floor, x):

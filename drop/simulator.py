@@ -27,15 +27,16 @@ from scipy.spatial.transform import Rotation
 
 from drop.body import (
     DIFFERENCE,
-    EYE,
     EYE3,
     GRAVITY,
+    JOINTS,
     LENGTHS,
     PATH,
     RADII,
     SKEW,
     STEP,
     N,
+    align,
     checked,
     checked_unit,
     project_range_of_motion,
@@ -171,6 +172,7 @@ class Box:
 # swinging foot that grazes the floor by a millimetre would be nailed to it.  (`Simulator.begin` lifts a body out of the
 # floor at once; a State made without it, 0.7 m under, takes 0.8 s to come up.)
 CONTACT_MARGIN, PUSH_OUT, SLIP = 0.005, 0.03, 1.0
+LEAVING = 0.001  # m a step, ASSUMED: a particle that the solver lifts faster than that lets go; nothing glues it down
 
 
 def gaps(x, obstacles, radii=RADII):
@@ -201,12 +203,15 @@ def project_contact(x, x_t, obstacles, here=None):
     Test      tests/drop/test_drop.py::test_project_contact
     """
     gap_t, normal = here or gaps(x_t, obstacles)
-    active = gaps(x, obstacles)[0] < np.where(gap_t < CONTACT_MARGIN, CONTACT_MARGIN, 0.0)
     move = x - x_t
-    move = move - np.einsum("ij,ij->i", move, normal)[:, None] * normal
+    along = np.einsum("ij,ij->i", move, normal)
+    leaves = (gap_t >= CONTACT_MARGIN) | (along > LEAVING)
+    active = gaps(x, obstacles)[0] < np.where(leaves, 0.0, CONTACT_MARGIN)
+    move = move - along[:, None] * normal
     length = np.sqrt(np.einsum("ij,ij->i", move, move))
     slide = np.maximum(0.0, 1.0 - SLIP * STEP / np.maximum(length, 1e-9))
-    return active, x_t + np.minimum(np.maximum(-gap_t, 0.0), PUSH_OUT)[:, None] * normal + slide[:, None] * move
+    out = np.maximum(np.minimum(np.maximum(-gap_t, 0.0), PUSH_OUT), along)  # nothing holds it down: no glue
+    return active, x_t + out[:, None] * normal + slide[:, None] * move
 
 
 def project_prior(x, samples):
@@ -219,6 +224,34 @@ def project_prior(x, samples):
     """
     d = (samples - x).reshape(len(samples), -1)
     return int(np.einsum("ij,ij->i", d, d).argmin())
+
+
+def project_friction(x, x_t):
+    r"""The pose of the last frame, laid on the solver's state as a rigid body.
+
+    Equation  E_fric = (w/2) min over rigid motions (R, c) of ‖x − (R (x_t − x̄_t) + c)‖²: c = x̄, R by `align` (Kabsch)
+    Why       a limp body's joints resist being bent; without that one that lies on the floor never comes to rest.  The
+              pull has no net force and no torque, so that momentum is kept and a fall through the air is not slowed
+    ASSUMED   the paper's rag doll has no such term
+    Args      x, x_t : (22, 3) the solver's state and the current one
+    Returns   (22, 3)
+    Test      tests/drop/test_drop.py::test_friction_of_limp_joints
+    """
+    centre, there = x.mean(axis=0), x_t - x_t.mean(axis=0)
+    return there @ align(there[None], (x - centre)[None])[0].T + centre
+
+
+REST = 0.15, 0.45  # m/s, ASSUMED: mean and largest speed of the particles of a limp body that comes to rest
+TRUNK = np.array([n.startswith(("pelvis", "hip", "spine", "neck", "collar", "head", "shoulder")) for n in JOINTS])
+
+
+def at_rest(v_t, gap):
+    """Does a limp body lie: slow in all its particles, its trunk on something?
+
+    Args      v_t : (22, 3) [m/s]; gap : (22,) of `gaps` [m]
+    Test      tests/drop/test_drop.py::test_who_lies_lies_still"""
+    speed = np.sqrt(np.einsum("ij,ij->i", v_t, v_t))
+    return bool(speed.mean() < REST[0] and speed.max() < REST[1] and gap[TRUNK].min() < CONTACT_MARGIN)
 
 
 def direction(w, x, x_t, v_tar, h=STEP):
@@ -237,10 +270,10 @@ def direction(w, x, x_t, v_tar, h=STEP):
 
 MU, EDGES = 0.8, 4  # ASSUMED: Coulomb friction of a shoe, edges of the linearised cone (Eq. 11)
 WRENCH_MARGIN = 0.03  # m, ASSUMED: a sphere this near to an obstacle may carry a contact force
-# ASSUMED: the root wrench that is left alone.  Up to this much of a push is borne by nothing, so it must be small;
-# built-in walks have medians of 4 to 8 themselves.  Runs have 14 to 20, and 42 to 58 in a twentieth of their frames:
-# drop.demos.Stage gives them that (`wrench_limit`).
-WRENCH_LIMIT = 15.0
+# The root wrench that is left alone, ASSUMED: the torque of the body's weight on the part of a foot that the model
+# lacks, from the ball's sphere to the tip of the toes (0.28 of the foot's length, mocap.gait.Body).  Up to this much of
+# a push is borne by nothing, so it must be small.  Built-in walks have medians of 4 to 8 themselves, runs of 14 to 20.
+WRENCH_LIMIT = N * 9.81 * 0.28 * 0.152 * 1.75  # 16 N m
 # w_p of Eq. 14, ASSUMED: of someone standing it removes 95 % of a residual force, 81 % of a torque that pitches or
 # rolls, 20 % of one that turns about the vertical
 WRENCH_WEIGHT = 1e-6
@@ -370,7 +403,10 @@ class State:
 class Weights:
     r"""Weights of the energies, in units of M/h² = 900 N/m; of `direction`, whose residual is a momentum, in 1/kg.
 
-    ASSUMED   §7 gives 1, 3, 3, 3 without a scale.  REPRODUCE.md has the table these were chosen from
+    inside is E_3's weight while the pose is inside its limits, where p = x: a drag towards the last iterate, at first
+    the prior's mode.  It counts where the prior alone drives (neither v_tar nor pins).  friction and stiction are of a
+    limp body's joints, moving and at rest.
+    ASSUMED   §7 gives 1, 3, 3, 3 without a scale.  REPRODUCE.md has the tables these were chosen from
     """
 
     rigidity: float = 3.0
@@ -379,6 +415,9 @@ class Weights:
     prior: float = 9.0
     direction: float = 0.3
     constraint: float = 30.0
+    inside: float = 1.0
+    friction: float = 1.0
+    stiction: float = 300.0
 
 
 @dataclass
@@ -406,11 +445,9 @@ class Simulator:
               restore : bone lengths made exact at the end of a step
               springs : ((joint, joint, length [m], weight), …), such as a stiff knee's
               wrench_limit : the root wrench below which nothing is corrected [N, N m]; wrench_weight : w_p of Eq. 14
-              inside : does E_3 take part while the pose is inside its limits, where p = x: "always", "never", or
-              "free", only where the prior alone drives (neither v_tar nor pins, and there are samples)
     ASSUMED   `restore`; only the part of the root wrench above `wrench_limit` is corrected (§8.5: down to mocap's
-              range); `inside`: with p = x that energy drags towards the last iterate, in the first iteration towards
-              the prior's mode.  That holds a walker's feet, but freezes a rag doll or a led body
+              range); a limp body (no samples) has joint limits, whatever `limits` is, friction in its joints
+              (`project_friction`), and once it lies at rest (`at_rest`) stays where it is until something moves it
     Raises    ValueError: a setting out of its range
     Test      tests/drop/test_drop.py::test_step_solves_equation_4, ::test_never_nan, ::test_switches,
               ::test_bad_settings
@@ -418,10 +455,9 @@ class Simulator:
 
     def __init__(self, prior=None, obstacles=(Plane(),), weights=None, samples=16, iterations=ITERATIONS, start="mode",
                  prior_at_first=False, contact=True, limits=project_range_of_motion, correction=True, restore=True,
-                 springs=(), wrench_limit=WRENCH_LIMIT, wrench_weight=WRENCH_WEIGHT, inside="free"):  # fmt: skip
-        for name, value, valid in (("start", start, ("mode", "y")), ("inside", inside, ("always", "never", "free"))):
-            if value not in valid:
-                raise ValueError(f"{name} {value!r}: valid are {', '.join(valid)}")
+                 springs=(), wrench_limit=WRENCH_LIMIT, wrench_weight=WRENCH_WEIGHT):  # fmt: skip
+        if start not in ("mode", "y"):
+            raise ValueError(f"start {start!r}: valid are mode, y")
         for name, value in (("samples", samples), ("iterations", iterations)):
             if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < 1:
                 raise ValueError(f"{name} {value!r}: it must be a whole number of 1 or more")
@@ -436,7 +472,7 @@ class Simulator:
         if not 0 < wrench_weight < np.inf:
             raise ValueError(f"wrench_weight {wrench_weight}: it must be above 0, and finite")
         gaps(np.zeros((N, 3)), self.obstacles)  # complains if there are none
-        self.wrench_limit, self.wrench_weight, self.inside = wrench_limit, wrench_weight, inside
+        self.wrench_limit, self.wrench_weight = wrench_limit, wrench_weight
         self.samples, self.iterations, self.start, self.prior_at_first = samples, iterations, start, prior_at_first
         self.contact, self.limits, self.correction, self.restore = contact, limits, correction, restore
         ends = np.array([[a, b] for a, b, _, _ in springs], int).reshape(-1, 2)
@@ -448,22 +484,22 @@ class Simulator:
 
     # ---- the global step
 
-    def inverse(self, active, prior, limited=False, pinned=(), direction=False):
+    def inverse(self, active, prior, limited=0.0, pinned=(), direction=False, friction=0.0):
         r"""The inverse of Eq. 4's matrix, times 1/h², for one set of active energies; computed once and kept.
 
         Equation  [DROP Eq. 4] M/h² + Σ_i w_i A_iᵀ A_i, divided by 1/h²
         Why       positive definite with a condition number below 100, so that an explicit inverse is as accurate as two
                   triangular solves and several times faster for 22 rows; x, y (and z without Eq. 16) share it
-        Args      active : (22,) bool; prior, limited : bool, E_kin and E_3 take part; pinned : joints; direction :
-                  bool, the rank-one term of Eq. 16
+        Args      active : (22,) bool; prior, limited, limp : bool, E_kin, E_3 and E_fric take part; pinned :
+                  joints; direction : bool, the rank-one term of Eq. 16
         Returns   (22, 22)
         """
-        key = active.tobytes(), prior, limited, tuple(pinned), direction
+        key = active.tobytes(), prior, limited, tuple(pinned), direction, friction
         if key not in self._inverses:
             if len(self._inverses) > 5000:
                 self._inverses.clear()
             w = self.w
-            diagonal = 1.0 + w.contact * active + w.range_of_motion * limited + w.prior * prior
+            diagonal = 1.0 + w.contact * active + limited + w.prior * prior + friction
             diagonal[list(pinned)] += w.constraint
             H = np.diag(diagonal) + self.JT @ self.A + (w.direction * np.ones((N, N)) if direction else 0.0)
             self._inverses[key] = cho_solve(cho_factor(H), np.eye(N))
@@ -505,8 +541,10 @@ class Simulator:
                 twist_of[choice] = twists(rotations[choice])
             return twist_of[choice]
 
-        free = self.inside == "free" and len(samples) > 0 and v_tar is None and not pins
-        inside = self.inside == "always" or free  # does E_3 count where p = x
+        limp = not len(samples)
+        slow = limp and at_rest(v_t, here[0])
+        friction = (w.stiction if slow else w.friction) if limp else 0.0
+        inside = w.inside if len(samples) > 0 and v_tar is None and not pins else 0.0
         for iteration in range(self.iterations):
             rhs = y + self.JT @ project_rigidity(x, self.A, self.lengths)
             active = np.zeros(N, bool)
@@ -515,20 +553,22 @@ class Simulator:
                 rhs += (w.contact * active)[:, None] * x_c
             if len(samples):
                 choice = project_prior(x, samples)
-            limited = False
-            if self.limits:
-                x_r = self.limits(x, twist())
-                limited = inside or bool(np.abs(x_r - x).max() > 1e-9)
-                rhs += w.range_of_motion * limited * x_r
+            limited = 0.0
+            if self.limits and not slow:
+                x_r = (project_range_of_motion if limp else self.limits)(x, twist())
+                limited = w.range_of_motion if np.abs(x_r - x).max() > 1e-9 else inside
+                rhs += limited * x_r
+            if friction:
+                rhs += friction * (x_t if slow else project_friction(x, x_t))
             kinematic = len(samples) > 0 and (iteration > 0 or self.prior_at_first or self.start == "y")
             if kinematic:
                 rhs += w.prior * samples[choice]
             for j, target in zip(pinned, targets, strict=True):
                 rhs[j] += w.constraint * target
-            x = self.inverse(active, kinematic, limited, pinned) @ rhs
+            x = self.inverse(active, kinematic, limited, pinned, friction=friction) @ rhs
             if v_tar is not None:  # Eq. 16 acts on x and y only
                 along = rhs[:, :2] + w.direction * (x_t[:, :2].sum(axis=0) + STEP * N * v_tar)
-                x[:, :2] = self.inverse(active, kinematic, limited, pinned, True) @ along
+                x[:, :2] = self.inverse(active, kinematic, limited, pinned, True, friction) @ along
         x_pd = x
 
         B, a = wrench_map(x_t, v_t, force)
@@ -536,13 +576,16 @@ class Simulator:
         F, edges = friction_basis(points, normals, state.com)
         c, residual = contact_forces(F, B @ x.ravel() - a)
         wrench_pd = float(np.sqrt(residual @ residual))
-        if self.correction and choice >= 0 and wrench_pd > self.wrench_limit:  # only what is above the limit
-            x = soft_correction(x, B, residual * (1.0 - self.wrench_limit / wrench_pd), self.wrench_weight)
+        correct = self.correction and choice >= 0
+        kept = residual * min(1.0, self.wrench_limit / max(wrench_pd, 1e-9))  # only what is above the limit is removed
         bone_error = float(np.abs(_lengths(x) / LENGTHS - 1).max())
         if self.restore:
             anchor = 1.0 + w.contact * active
             anchor[list(pinned)] += w.constraint
-            x = restore_bones(x, anchor)
+            wanted = (B, B @ x.ravel() - residual + kept, self.wrench_weight) if correct else None
+            x = restore_bones(x, anchor, wanted)
+        elif correct:
+            x = soft_correction(x, B, residual - kept, self.wrench_weight)
         left = residual + B @ (x - x_pd).ravel()
         wrench = float(np.sqrt(left @ left))
 
@@ -580,6 +623,8 @@ class Simulator:
             "range_of_motion": 0.5 * w.range_of_motion * unit * square(x - x_r),
             "prior": 0.0 if x_kin is None else 0.5 * w.prior * unit * square(x - x_kin),
         }
+        if x_kin is None:
+            out["friction"] = 0.5 * w.friction * unit * square(x - project_friction(x, x_t))
         if v_tar is not None:
             out["direction"] = direction(w.direction, x, x_t, v_tar)[0]
         if pins:
@@ -617,29 +662,44 @@ class Simulator:
         return State(x, v, checked_unit(quat, "rotations").copy(), 0, v.copy())
 
 
-def restore_bones(x, anchor, iterations=3):
-    r"""Bones at their rest lengths, by the nearest change of positions.
+def restore_bones(x_pd, anchor, wrench=None, iterations=3):
+    r"""Bones at their rest lengths and less of the root wrench, by the nearest change of positions: both at once.
 
-    Equation  min Σ_j a_j ‖x'_j − x_j‖² subject to ‖A x'‖ = l, by Newton steps on the constraint (the fast projection of
-              Goldenthal et al. 2007): A⁻¹ is diag(1/a), x ← x − A⁻¹ Jᵀ (J A⁻¹ Jᵀ)⁻¹ (‖bones‖ − l), J the bones'
-              directions. What is left after the last step goes by forward kinematics along the bones
-    Why       the change is a sum of forces along bones: with equal a it keeps linear and angular momentum
+    Equation  [DROP Eq. 14, bones as constraints] min Σ_j a_j ‖x_j − x_pd,j‖² + w_p ‖B x − t‖² s.t. ‖D x‖ = l.  Newton
+              steps on the constraints (the fast projection of Goldenthal et al. 2007; the wrench as a compliant one, as
+              in XPBD, Macklin et al. 2016): with J the bones' directions, G = [J; B], C = diag(0, I/w_p), c = [‖D x‖ −
+              l; B x − t]: δ = (G A⁻¹ Gᵀ + C)⁻¹ (c − C λ), λ ← λ + δ, x ← x − A⁻¹ Gᵀ δ.  What is left after the last
+              step goes by forward kinematics along the bones
+    Why       one after the other undo each other: restored bones brought back two thirds of the wrench that Eq. 14 had
+              removed (REPRODUCE.md).  Without a wrench and with equal a the change is a sum of forces along bones and
+              keeps momentum.  An anchor is an outside force on its particle: there the wrench's own term must hold it
     ASSUMED   the paper relies on strong springs alone.  `anchor` is 1 a particle, more for those that contacts hold
-    Args      x : (22, 3); anchor : (22,) > 0
+    Args      x_pd : (22, 3); anchor : (22,) > 0; wrench : None or (B (6, 66), t (6,), w_p)
     Returns   (22, 3)
-    Test      tests/drop/test_drop.py::test_restore_bones
+    Test      tests/drop/test_drop.py::test_restore_bones, ::test_bones_and_wrench_together
     """
-    # J A⁻¹ Jᵀ couples two bones through the joint they share: (D A⁻¹ Dᵀ) ∘ (d dᵀ), D the differences
-    coupling = (DIFFERENCE / anchor) @ DIFFERENCE.T
-    for _ in range(iterations):
+    k, x, weights = N - 1, x_pd, np.repeat(1.0 / anchor, 3)
+    rows = k if wrench is None else k + 6
+    G, c, lam, C = np.zeros((rows, 3 * N)), np.zeros(rows), np.zeros(rows), np.full(rows, 1e-9)
+    if wrench is not None:
+        B, wanted, weight = wrench
+        G[k:], C[k:] = B, 1.0 / weight
+    for i in range(iterations):
         bones = DIFFERENCE @ x
         length = np.sqrt(np.einsum("ij,ij->i", bones, bones))
-        error = length - LENGTHS
-        if np.abs(error).max() < 1e-6 or length.min() < 1e-3:
+        c[:k] = length - LENGTHS
+        done = np.abs(c[:k]).max() < 1e-6 and (i > 0 or wrench is None)
+        if done or length.min() < 1e-3:
             break
-        d = bones / length[:, None]
-        lam = np.linalg.solve(coupling * (d @ d.T) + 1e-9 * EYE[1:, 1:], error)
-        x = x - (DIFFERENCE.T @ (lam[:, None] * d)) / anchor[:, None]
+        G[:k] = (DIFFERENCE[:, :, None] * (bones / length[:, None])[:, None]).reshape(k, -1)
+        if wrench is not None:
+            c[k:] = B @ x.ravel() - wanted
+        scaled = G * weights
+        S = scaled @ G.T
+        S[np.diag_indices(rows)] += C
+        step = np.linalg.solve(S, c - C * lam)
+        lam += step
+        x = x - (step @ scaled).reshape(N, 3)
     out = PATH @ project_rigidity(x)
     return out + anchor @ (x - out) / anchor.sum()
 

@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from drop import body, simulator, vae
 from drop.body import FEET, STEP, N
-from drop.prior import WEIGHTS, NearestPrior, PoseRange, VaePrior, load_networks, pose_angles
+from drop.keyposes import rises
+from drop.prior import WEIGHTS, NearestPrior, PoseRange, VaePrior, contacts_of, load_networks, pose_angles
 from drop.simulator import Simulator
 from mocap import data
 from nn import Adam, clip_grad_norm
@@ -56,7 +57,7 @@ class Options:
     clips: str = arg("*", "shell pattern on clip names")
     out: str = arg("runs/drop_prior", "run folder")
     resume: bool = arg(False, "continue the run in --out exactly")
-    init: str | None = arg(None, "begin with the networks of this file, at its count of updates; fresh moments")
+    init: str | None = arg(None, "begin with this file's networks, at its count of updates; fresh moments")
     updates: int = arg(7_000, "updates of the motion VAE; the pose VAE has half", check=POSITIVE)
     batch: int = arg(192, "transitions an update", check=COUNT)
     rollout: int = arg(8, "frames K of a rollout, an update each", check=COUNT)
@@ -67,6 +68,7 @@ class Options:
     lr: float = arg(1e-3, "Adam's step at first; it falls to a hundredth as a half cosine", check=POSITIVE)
     kl: float = arg(0.5, "weight of the KL divergence, grown from 0 in the first fifth", check=NONNEGATIVE)
     beta: float = arg(0.2, "share of a deviation that the target takes back in a frame", check=UNIT)
+    rises: int = arg(0, "how many times the eight built-in get-ups are among the clips", check=NONNEGATIVE)
     seed: int = arg(0, "seed of weights, batches and noise", check=NONNEGATIVE)
     checkpoint_minutes: float = arg(2.0, "minutes between checkpoints", check=NONNEGATIVE)
     frames: int = arg(10_000, "rollout: frames", check=POSITIVE)
@@ -80,7 +82,8 @@ class Recording:
     r"""Frames of many clips in one array.
 
     Args      clips : list of (x (T, 22, 3), quat (T, 22, 4))
-    Symbols   x (F, 22, 3), columns (F, 22, 2, 3), float32; `starts(K)`: frames with one before and K after
+    Symbols   x (F, 22, 3), columns (F, 22, 2, 3), contacts (F, 4) of FEET, float32; `starts(K)`: frames with one before
+              and K after
     Test      tests/drop/test_drop_vae.py::test_recording
     """
 
@@ -90,6 +93,7 @@ class Recording:
             raise UserError("no clip has three frames or more: give longer ones")
         self.x = np.concatenate([x for x, _ in clips]).astype(np.float32)
         self.columns = np.concatenate([vae.columns_of(q) for _, q in clips]).astype(np.float32)
+        self.contacts = np.concatenate([contacts_of(x) for x, _ in clips]).astype(np.float32)
         self.lengths = [len(x) for x, _ in clips]
 
     def starts(self, K):
@@ -106,6 +110,11 @@ class Recording:
         mx, mc = vae.mirrored(x, columns)
         return np.where(flip[:, None, None], mx, x), np.where(flip[:, None, None, None], mc, columns)
 
+    def contacts_at(self, frames, flip):
+        """Contacts (B, 4) of frames (B,), of the mirror image where flip (B,)."""
+        c = self.contacts[frames]
+        return np.where(flip[:, None], c[:, [2, 3, 0, 1]], c)
+
 
 def recorded(motion, split, clips="*", stitched=True, verbose=True):
     """Clips of a split as (x, quat); train clips stitched into sequences.
@@ -118,13 +127,29 @@ def recorded(motion, split, clips="*", stitched=True, verbose=True):
     return [body.character_motion(c) for c in found if len(c) > 2]
 
 
+def held_out(sets, clips="*"):
+    """Validation clips of those of the sets that have some.
+
+    Raises    UserError: none has
+    Test      tests/drop/test_drop_vae.py::test_recording"""
+    found, problem = [], None
+    for one in sets:
+        try:
+            found += recorded(one, "validation", clips, stitched=False)
+        except UserError as none:
+            problem = none
+    if not found and problem:
+        raise problem
+    return found
+
+
 def transition(recording, frames, flip, x, columns, v, beta):
     r"""What a batch of states, on the recording or beside it, should lead to.
 
     Equation  target = recorded next frame + (1 − β) (state − recorded state), each in its own heading frame; nothing
               pulls at place and heading
     Args      recording : Recording; frames, flip (B,); x, columns, v : world states
-    Returns   (state vector, height, columns, target x, target columns) for MotionVAE.loss; frame of the state;
+    Returns   (state vector, height, columns, target x, columns, contacts) for MotionVAE.loss; frame of the state;
               the recorded x and columns, now and next, world
     Test      tests/drop/test_drop_vae.py::test_transition
     """
@@ -134,7 +159,7 @@ def transition(recording, frames, flip, x, columns, v, beta):
     ax, ac, _, _ = vae.canonical(*after, after[0], there)
     keep = np.float32(1.0 - beta)
     batch = vae.state_vector(cx, cc, cv), cx[:, 0, 2], cc, ax + keep * (cx - nx), ac + keep * (cc - nc)
-    return batch, frame, now, after
+    return (*batch, recording.contacts_at(frames + 1, flip)), frame, now, after
 
 
 # ------------------------------------------------------------------------------------ training
@@ -162,7 +187,7 @@ class Trainer:
         for _ in range(0, n, 1000):
             frames, flip = rng.choice(self.starts, 1000), rng.random(1000) < 0.5
             x, columns, v = self._begin(frames, flip, rng)
-            (s, height, columns, tx, tc), _, _, _ = transition(
+            (s, height, columns, tx, tc, _), _, _, _ = transition(
                 self.recording, frames, flip, x, columns, v, self.opt.beta
             )
             move = tx[:, 0] - np.stack([0 * height, 0 * height, height], axis=1)
@@ -226,7 +251,7 @@ class Trainer:
         s = self.motion.normalise(state[:half])
         mu, log_std, _ = self.motion.gaussian("prior", s)
         z = mu + np.exp(log_std) * self.rng.standard_normal(mu.shape).astype(np.float32)
-        sx, sC = self.motion.decode(s, z, height[:half], columns[:half])
+        sx, sC, _ = self.motion.decode(s, z, height[:half], columns[:half])
         return np.concatenate([sx, x[half:]]), np.concatenate([sC, C[half:]])
 
     def _pose_loss(self, now, kl):
@@ -242,7 +267,7 @@ class Trainer:
             self.adam[name].step(self.nets[name].theta, grad)
 
     def begin_from(self, path):
-        """Go on from shipped networks, which have no optimiser: their weights, statistics and count of updates.
+        """Go on from shipped networks, which have no optimiser: their weights and updates, this data's statistics.
 
         Raises    UserError: networks of other sizes
         Test      tests/drop/test_drop_vae.py::test_training_from_shipped_networks
@@ -254,7 +279,8 @@ class Trainer:
                 sizes = " ".join(f"--{n.replace('_', '-')} {o[n]}" for n in SIZES)
                 raise UserError(f"{path}: its networks have other sizes; give them: {sizes}")
             self.nets[k].theta[:] = net.theta
-        self.motion.stats, self.pose.stats = motion.stats, pose.stats
+        rebase(self.motion, motion.stats, self.motion.stats)
+        self.pose.stats = pose.stats
         self.updates = int(meta["updates"])
 
     def arrays(self):
@@ -280,6 +306,31 @@ class Trainer:
             ) from None
 
 
+def rebase(net, old, new):
+    r"""The same function of metres, with other statistics: a MotionVAE's first and last layers, in place.
+
+    Equation  inputs (r − m)/s: W' = diag(s'/s) W, b' = b + ((m' − m)/s) W;  outputs y c + o: W' = W diag(c/c'), b' =
+              (b c + o − o')/c'.  What the old statistics cut at CLIP standard deviations may be seen now
+    Args      net : MotionVAE; old, new : statistics, those that its weights are for and those that it shall have
+    Test      tests/drop/test_drop_vae.py::test_rebase
+    """
+    n, k = vae.STATE, vae.OUTPUT
+    shift, stretch = (new["mean"] - old["mean"]) / old["std"], new["std"] / old["std"]
+    moved, grown = (new["offset"] - old["offset"]) / old["scale"], new["scale"] / old["scale"]
+    for name, each in net.nets.items():
+        W, b = each.params["W0"], each.params["b0"]
+        b += shift @ W[:n]
+        W[:n] *= stretch[:, None]
+        if name == "posterior":
+            b += moved @ W[n:]
+            W[n:] *= grown[:, None]
+    last = net.nets["decoder"].n_layers - 1
+    W, b = (net.nets["decoder"].params[f"{p}{last}"] for p in "Wb")
+    W[:, :k] /= grown
+    b[:k] = (b[:k] - moved) / grown
+    net.stats = {name: np.asarray(v, net.stats[name].dtype) for name, v in new.items()}
+
+
 def network_arrays(motion, pose, dtype=np.float32):
     """Weights and statistics by name.  Test: tests/drop/test_drop_vae.py::test_shipped"""
     out = {k: net.theta.astype(dtype) for k, net in vae.networks(motion, pose).items()}
@@ -289,7 +340,7 @@ def network_arrays(motion, pose, dtype=np.float32):
 def train(opt):
     """python -m drop train.  Test: tests/drop/test_drop_vae.py::test_training_resumes, ::test_command"""
     check_run(opt.out, opt.resume)
-    recording = Recording(recorded(opt.motion, "train", opt.clips))
+    recording = Recording(recorded(opt.motion, "train", opt.clips) + opt.rises * [r[1:] for r in rises()])
     trainer, meta = Trainer(opt, recording), {"rows": 0}
     if opt.resume and (found := latest_checkpoint(opt.out)):
         trainer.restore(*found, Path(opt.out) / CHECKPOINT)
@@ -336,7 +387,7 @@ class LinearAR:
         frames = np.random.default_rng(seed).choice(recording.starts(1), n)
         s, wanted = [], []
         for part in np.array_split(frames, max(n // 2000, 1)):
-            state, height, columns, tx, tc = _clean(recording, part)[0]
+            state, height, columns, tx, tc, _ = _clean(recording, part)[0]
             move = tx[:, 0] - np.stack([0 * height, 0 * height, height], axis=1)
             s.append(net.normalise(state))
             wanted.append(np.concatenate([move, (tc - columns).reshape(len(s[-1]), -1)], axis=1))
@@ -375,7 +426,7 @@ def one_step(net, linear, recording, rng, n=4000, samples=16):
 
     for part in np.array_split(frames, max(len(frames) // 500, 1)):
         batch, *_ = _clean(recording, part)
-        state, height, columns, tx, tc = batch
+        state, height, columns, tx, tc, _ = batch
         s, error = net.normalise(state), lambda x: 1e3 * np.linalg.norm(x - tx, axis=-1).mean(axis=-1)  # noqa: B023
         v = state[:, -3 * N :].reshape(-1, N, 3) / vae.VELOCITY_SCALE
         here = np.concatenate([np.zeros((len(s), 1, 3), np.float32), state[:, 1 : 3 * N - 2].reshape(-1, N - 1, 3)], 1)
@@ -407,7 +458,7 @@ def open_loop(net, predict, recording, rng, horizons=(5, 15, 30), n=300):
     v, out = (x - before) / np.float32(STEP), []
     for k in range(1, max(horizons) + 1):
         cx, cc, cv, frame = vae.canonical(x, columns, v)
-        nx, C = predict(net.normalise(vae.state_vector(cx, cc, cv)), cx[:, 0, 2], cc)
+        nx, C, *_ = predict(net.normalise(vae.state_vector(cx, cc, cv)), cx[:, 0, 2], cc)
         there = vae.to_world(nx, np.ascontiguousarray(C[..., :2, :]), frame)
         x, columns, v = there[0], there[1], (there[0] - x) / np.float32(STEP)
         if k in horizons:
@@ -603,9 +654,9 @@ def ship(opt):
     motion, pose, meta = load_networks(Path(opt.out) / CHECKPOINT)
     trained = stored_options(Options, opt.out)
     sets = data.parts(trained["motion"])
-    held = Recording(recorded(trained["motion"], "validation", trained["clips"], stitched=False))
+    held = Recording(held_out(sets, trained["clips"]))
     options = {k: v for k, v in trained.items() if k not in ("weights", "out", "resume")} | {
-        "motion": ",".join(Path(s).name for s in sets)
+        "motion": ",".join(map(data.set_name, sets))
     }
     licence = "; ".join(f"weights trained on {text}" for text in data.licences(sets)) or "MIT"
     bound, angle = calibrate(pose, held)

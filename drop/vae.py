@@ -2,6 +2,7 @@ r"""The networks of DROP's learned priors: a conditional VAE of motion and a VAE
 
     s_t, x_{t+1} ──► posterior q(z | s_t, x_{t+1}) ─┐ z            z at every layer
     s_t ───────────► prior     p(z | s_t) ── KL ────┴──► decoder(s_t, z) ──► residual ──► Gram-Schmidt ──► kinematics
+                                                                        └──► which feet stand on the floor
     q ─────────────► encoder E(q), a Gaussian ── KL to N(0, I) ──► decoder D(z) ──► Gram-Schmidt ──► kinematics
 
 The ideas are HuMoR's (Rempe et al., ICCV 2021) and MotionVAE's (Ling et al., SIGGRAPH 2020), the networks small.
@@ -26,6 +27,7 @@ from nn import MLP, linear_backward, linear_forward, orthogonal
 # What a state is made of: pelvis height; the other joints; columns of all rotations; velocities.
 STATE = 1 + 3 * (N - 1) + 6 * N + 3 * N
 OUTPUT = 3 + 6 * N  # residual: displacement of the pelvis; change of the columns
+CONTACTS = 4  # and do ankle and ball of the left foot, of the right, stand on the floor: logits
 VELOCITY_SCALE = 0.1  # s: 1 m/s beside 10 cm of pose, as in mocap.stitch.motion_features
 CLIP = 4.0  # ASSUMED: standard deviations beyond which inputs are cut, so that a fallen body stays a sane input
 LOG_STD_BOUND = 3.0  # ASSUMED: |log σ| stays below it, smoothly
@@ -310,7 +312,7 @@ class MotionVAE:
         self.nets = {
             "prior": MLP((STATE, half, half, 2 * latent), rng=rng, gain=0.1, dtype=dtype),
             "posterior": MLP((STATE + OUTPUT, half, half, 2 * latent), rng=rng, gain=0.1, dtype=dtype),
-            "decoder": LatentMLP((STATE, hidden, hidden, OUTPUT), latent, rng, gain=0.1, dtype=dtype),
+            "decoder": LatentMLP((STATE, hidden, hidden, OUTPUT + CONTACTS), latent, rng, gain=0.1, dtype=dtype),
         }
 
     def normalise(self, state):
@@ -331,27 +333,30 @@ class MotionVAE:
 
     def residual(self, y):
         """The decoder's output in metres and columns: displacement (B, 3), change of the columns (B, 22, 2, 3)."""
-        y = y * self.stats["scale"] + self.stats["offset"]
+        y = y[:, :OUTPUT] * self.stats["scale"] + self.stats["offset"]
         return y[:, :3], y[:, 3:].reshape(-1, N, 2, 3)
 
     def decode(self, s, z, height, columns):
-        """The next frame in the heading frame of this one: x (B, 22, 3), C (B, 22, 3, 3).
+        """The next frame in the heading frame of this one: x (B, 22, 3), C (B, 22, 3, 3), contacts (B, 4) as logits.
 
         Test: tests/drop/test_drop_vae.py::test_motion_vae"""
-        move, change = self.residual(self.nets["decoder"](s, z))
+        y = self.nets["decoder"](s, z)
+        move, change = self.residual(y)
         C, _ = gram_schmidt_forward(columns + change)
         root = move.copy()
         root[:, 2] += height
-        return kinematics_forward(root, C), C
+        return kinematics_forward(root, C), C, y[:, OUTPUT:]
 
-    def loss(self, state, height, columns, x_next, columns_next, eps, kl_weight=1.0):
+    def loss(self, state, height, columns, x_next, columns_next, contacts, eps, kl_weight=1.0):
         r"""The negative ELBO of a batch and its gradients.
 
-        Equation  L = mean ‖x̃ − x*‖²_w/(2 σ_x²) + ‖r̃ − r*‖²/(2 σ_R²) + w_KL KL(q(z | s, x*) ‖ p(z | s)), z = μ + σ ε;
-                  x̃ by forward kinematics of r̃, the decoder's columns
+        Equation  L = mean ‖x̃ − x*‖²_w/(2 σ_x²) + ‖r̃ − r*‖²/(2 σ_R²) + BCE(c̃, c*) + w_KL KL(q(z | s, x*) ‖ p(z | s)),
+                  z = μ + σ ε; x̃ by forward kinematics of r̃, the decoder's columns; BCE = Σ log(1 + e^c̃) − c* c̃, the
+                  contacts that HuMoR predicts, too
         Args      state (B, STATE) not normalised; height (B,), columns (B, 22, 2, 3) of this frame; x_next,
-                  columns_next the target, in the heading frame of this one; eps (B, latent) standard normal
-        Returns   parts : {reconstruction, kl} [nat], means; dtheta by net; x̃, C of the reconstruction
+                  columns_next the target, in the heading frame of this one; contacts (B, 4) of the target, 0 or 1;
+                  eps (B, latent) standard normal
+        Returns   parts : {reconstruction, contact, kl} [nat], means; dtheta by net; x̃, C of the reconstruction
         Test      tests/drop/test_drop_vae.py::test_motion_vae
         """
         b, stats = len(state), self.stats
@@ -375,11 +380,15 @@ class MotionVAE:
         w = _WEIGHTS[:, None].astype(x.dtype)
         ex, er = x - x_next, raw - columns_next
         reconstruction = 0.5 * (np.sum(w * ex * ex) / SIGMA_X**2 + np.sum(er * er) / SIGMA_R**2) / b
+        logits = y[:, OUTPUT:]
+        contact = float(np.sum(np.logaddexp(0.0, logits) - contacts * logits)) / b
         kl, (dmu, dlog, dmu0, dlog0) = kl_forward(mu, log, mu0, log0)
 
         droot, dC = kinematics_backward(w * ex / (SIGMA_X**2 * b))
         draw = gram_schmidt_backward(dC, gs_cache) + er / (SIGMA_R**2 * b)
         dy = np.concatenate([droot, draw.reshape(b, -1)], axis=1) * stats["scale"]
+        dlogits = (1.0 / (1.0 + np.exp(-logits)) - contacts) / b
+        dy = np.concatenate([dy, dlogits], axis=1)
         _, dz, d_decoder = self.nets["decoder"].backward(dy, decoder_cache)
         k = kl_weight / b
         grads = {
@@ -387,7 +396,7 @@ class MotionVAE:
             "posterior": self.gaussian_backward("posterior", dz + k * dmu, dz * eps * std + k * dlog, posterior_cache),
             "decoder": d_decoder,
         }
-        return {"reconstruction": float(reconstruction), "kl": float(kl.mean())}, grads, x, C
+        return {"reconstruction": float(reconstruction), "contact": contact, "kl": float(kl.mean())}, grads, x, C
 
 
 # ------------------------------------------------------------------------------------ Eq. 15's network

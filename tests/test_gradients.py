@@ -242,7 +242,7 @@ def elbo(nets, loss):
         for name, theta in thetas.items():
             nets[name].theta[:] = theta
         parts = loss()[0]
-        return parts["reconstruction"] + 0.7 * parts["kl"]
+        return parts["reconstruction"] + parts.get("contact", 0.0) + 0.7 * parts["kl"]
 
     def backward(up, **thetas):
         forward(**thetas)
@@ -256,8 +256,9 @@ def motion_vae(rng):
     own = vae.MotionVAE(3, 10, statistics(rng)[0], rng, np.float64)
     x, columns, v, _ = vae.canonical(*frames(rng))
     state, eps = vae.state_vector(x, columns, v), rng.standard_normal((3, 3))
-    target = x + 0.02 * rng.standard_normal(x.shape), columns + 0.02 * rng.standard_normal(columns.shape)
-    return elbo(own.nets, lambda: own.loss(state, x[:, 0, 2], columns, *target, eps, 0.7))
+    target = x + 0.002 * rng.standard_normal(x.shape), columns + 0.002 * rng.standard_normal(columns.shape)
+    contacts = (rng.random((3, vae.CONTACTS)) < 0.5).astype(float)
+    return elbo(own.nets, lambda: own.loss(state, x[:, 0, 2], columns, *target, contacts, eps, 0.7))
 
 
 @pair("vae.PoseVAE")

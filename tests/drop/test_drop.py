@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from drop import prior as prior_module
 from drop import simulator
 from drop.body import (
     AXIS,
@@ -44,7 +45,7 @@ from drop.body import (
     twists,
 )
 from drop.demos import forearm
-from drop.prior import ClipPrior, NearestPrior, SwitchPrior
+from drop.prior import LEGS, ClipPrior, NearestPrior, SwitchPrior
 from drop.simulator import Box, Plane, Simulator, Spheres, State, Weights
 from human import Clip, quat_matrix
 from mocap import gait
@@ -259,6 +260,9 @@ def test_project_contact():
     along = (x[low] - x_t[low]) - ((x[low] - x_t[low]) @ plane.normal) * plane.normal
     assert abs(move @ plane.normal) < 1e-12
     assert np.linalg.norm(move) == pytest.approx(np.linalg.norm(along) - simulator.SLIP * STEP)
+    down = x_t - 0.009 * plane.normal  # a millimetre above the plane: in contact already
+    for lift, held in ((0.0, True), (0.003, False)):  # what the solver lifts lets go: no glue
+        assert simulator.project_contact(down + lift * plane.normal, down, [plane])[0][low] == held
     sunk = x_t - 0.02 * plane.normal
     active, x_c = simulator.project_contact(sunk, sunk, [plane])
     np.testing.assert_allclose(plane.distance(x_c[active])[0] - RADII[active], 0.0, atol=1e-12)
@@ -454,6 +458,7 @@ def test_a_simulator_corrects_with_its_own_weight():
 def test_step_solves_equation_4():
     """One iteration's global step minimises Eq. 1 with the projections held, by SciPy; the energies' sum falls."""
     sim = Simulator(None, contact=True, limits=None, restore=False, iterations=1)
+    assert sim.w.friction > 0
     state = State(STAND - [0, 0, 0.01], np.zeros((N, 3)), REST)
     got, _ = sim.step(state)
     y = simulator.inertial_target(state.x, state.v, np.zeros((N, 3)))
@@ -463,6 +468,7 @@ def test_step_solves_equation_4():
     d = simulator.project_rigidity(start)
     active, x_c = simulator.project_contact(start, state.x, [Plane()])
     unit, w = 1 / STEP**2, sim.w
+    laid = simulator.project_friction(start, state.x)
 
     def energy(z):
         z = z.reshape(N, 3)
@@ -470,13 +476,15 @@ def test_step_solves_equation_4():
             simulator.momentum(z, y),
             simulator.spring(w.rigidity * unit, DIFFERENCE, z, d),
             simulator.spring(w.contact * unit * active, np.eye(N), z, x_c),
+            simulator.spring(w.friction * unit, np.eye(N), z, laid),
         ]
         return sum(p[0] for p in parts), sum(p[1] for p in parts).ravel()
 
     found = minimize(energy, state.x.ravel(), jac=True, method="BFGS", options={"gtol": 1e-7, "maxiter": 3000})
     np.testing.assert_allclose(got.x.ravel(), found.x, atol=1e-6)
-    H = sim.inverse(active, False)
-    np.testing.assert_allclose(np.linalg.inv(H) @ got.x, y + sim.JT @ d + w.contact * active[:, None] * x_c, atol=1e-9)
+    H = sim.inverse(active, False, friction=w.friction)
+    rhs = y + sim.JT @ d + w.contact * active[:, None] * x_c + w.friction * laid
+    np.testing.assert_allclose(np.linalg.inv(H) @ got.x, rhs, atol=1e-9)
 
     totals = []
     for iterations in (1, 3, 10, 40):
@@ -581,6 +589,67 @@ def test_restore_bones():
     )
 
 
+def test_bones_and_wrench_together():
+    """Eq. 14 with bones as constraints, against SciPy; anchored bones alone change the wrench, together they do not."""
+    rng = np.random.default_rng(3)
+    x, v = STAND + 0.02 * rng.standard_normal((N, 3)), 0.3 * rng.standard_normal((N, 3))
+    anchor = np.where(np.isin(np.arange(N), FEET), 10.0, 1.0)
+    B, a = simulator.wrench_map(STAND, v, np.zeros((N, 3)))
+    t = B @ x.ravel() - np.array([60.0, -30.0, 20.0, 10.0, -5.0, 8.0])
+    weight = 1e-6
+    out = simulator.restore_bones(x, anchor, (B, t, weight), iterations=8)
+    np.testing.assert_allclose(np.linalg.norm(DIFFERENCE @ out, axis=1), LENGTHS)
+
+    def cost(z):
+        d, e = z - x.ravel(), B @ z - t
+        return d @ (np.repeat(anchor, 3) * d) + weight * e @ e, 2 * np.repeat(anchor, 3) * d + 2 * weight * B.T @ e
+
+    lengths = {"type": "eq", "fun": lambda z: np.linalg.norm(DIFFERENCE @ z.reshape(N, 3), axis=1) - LENGTHS}
+    options = {"maxiter": 200, "ftol": 1e-14}
+    found = minimize(cost, x.ravel(), jac=True, method="SLSQP", constraints=lengths, options=options)
+    assert cost(out.ravel())[0] < 1.02 * found.fun
+    alone = simulator.restore_bones(x, anchor)
+    stiff = simulator.restore_bones(x, anchor, (B, B @ x.ravel(), 1.0), iterations=8)
+    away = lambda y: np.linalg.norm(B @ (y - x).ravel())  # noqa: E731
+    assert away(stiff) < 0.05 * away(alone)
+    free = simulator.restore_bones(x, np.ones(N), (B, t, weight), iterations=8) - x  # no bone's error: Eq. 14 alone
+    exact = STAND.copy()
+    got = simulator.restore_bones(exact, np.ones(N), (B, B @ exact.ravel() - 1e-3, weight))
+    np.testing.assert_allclose(got, simulator.soft_correction(exact, B, np.full(6, 1e-3), weight), atol=1e-6)
+    assert np.abs(free).max() < 0.2
+
+
+def test_friction_of_limp_joints():
+    """The pose is laid on as a rigid body: no force, no torque; whatever a rigid motion did to it is not held back."""
+    rng = np.random.default_rng(5)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.8]).as_matrix()
+    moved = STAND @ turn.T + [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(simulator.project_friction(moved, STAND), moved, atol=1e-12)
+    x = STAND + 0.03 * rng.standard_normal((N, 3))
+    p = simulator.project_friction(x, STAND)
+    np.testing.assert_allclose(p.mean(axis=0), x.mean(axis=0), atol=1e-12)
+    assert np.abs(np.cross(x - x.mean(axis=0), p - x).sum(axis=0)).max() < 1e-12
+    near = np.sum((p - x) ** 2)
+    for _ in range(50):  # no rigid motion of STAND lies nearer
+        other = STAND @ Rotation.from_rotvec(0.05 * rng.standard_normal(3)).as_matrix().T
+        assert near <= np.sum((other - other.mean(axis=0) + x.mean(axis=0) - x) ** 2) + 1e-12
+
+
+@pytest.mark.parametrize("newton, seed", [(0.0, 0), (300.0, 1)])
+def test_who_lies_lies_still(newton, seed):
+    """Ten seconds after a rag doll fell no particle moves; one that balances on its feet does not count as lying."""
+    x, quat = motion()
+    sim = Simulator(None)
+    state = sim.begin(x[60 + seed], quat[60 + seed], (x[60 + seed] - x[59 + seed]) / STEP)
+    assert not simulator.at_rest(np.zeros((N, 3)), simulator.gaps(state.x, [Plane()])[0])
+    force = np.zeros((N, 3))
+    force[J["spine3"], 1] = newton
+    for t in range(300):
+        state, _ = sim.step(state, force if t < 8 else None)
+    assert np.linalg.norm(state.v, axis=1).max() < 0.05 and state.com[2] < 0.3
+    assert simulator.at_rest(state.v, simulator.gaps(state.x, [Plane()])[0])
+
+
 def test_inverse_is_kept():
     """One factorisation an active set; Eq. 16's rank-one term is another set."""
     sim = Simulator(None)
@@ -594,7 +663,7 @@ def test_inverse_is_kept():
         + w.rigidity * DIFFERENCE.T @ DIFFERENCE
         + w.direction * np.ones((N, N))
     )
-    np.testing.assert_allclose(sim.inverse(a, True, True, (), True) @ H, np.eye(N), atol=1e-9)
+    np.testing.assert_allclose(sim.inverse(a, True, w.range_of_motion, (), True) @ H, np.eye(N), atol=1e-9)
 
 
 def test_walking_goes_on():
@@ -668,22 +737,22 @@ def test_without_contact_the_prior_still_walks():
 
 
 def test_energy_inside_the_limits():
-    """With p = x E_3 holds a body where it is "always", never "never"; "free": only where the prior alone drives.
+    """With p = x E_3's own weight drags a body towards the mode; of a led or held one it is left out.
 
     Whether a pose is inside is seen from the numbers: a projection that returns a copy is the same projection."""
     state = state_of(Simulator(None))
     pins = {J["wrist_l"]: state.x[J["wrist_l"]] + 0.05}
 
     def run(inside, pins=None, limits=project_range_of_motion):
-        sim = Simulator(prior(), inside=inside, limits=limits)
+        sim = Simulator(prior(), weights=Weights(inside=inside), limits=limits)
         return sim.step(state, pins=pins, rng=np.random.default_rng(0))[0].x
 
-    assert np.abs(run("always") - run("never")).max() > 1e-4
-    np.testing.assert_array_equal(run("free"), run("always"))
-    np.testing.assert_array_equal(run("free", pins), run("never", pins))
-    assert np.abs(run("always", pins) - run("never", pins)).max() > 1e-5
+    mode = prior().mode(state)[0]
+    off = [np.linalg.norm(run(inside) - mode) for inside in (0.0, 1.0, 9.0)]
+    assert off[2] < off[0] and off[1] != off[0]
+    np.testing.assert_array_equal(run(9.0, pins), run(0.0, pins))
     copy = lambda x, twist: project_range_of_motion(x, twist).copy()  # noqa: E731
-    np.testing.assert_array_equal(run("never", limits=copy), run("never"))
+    np.testing.assert_array_equal(run(0.0, limits=copy), run(0.0))
 
 
 def test_a_small_push_is_not_swallowed():
@@ -701,7 +770,7 @@ def test_a_small_push_is_not_swallowed():
     free = 40.0 / N * STEP**2 * 8 * 9 / 2  # 7 cm, without anything to hold it
     assert 0.2 * free < moved < 1.2 * free
     assert centre(40.0, wrench_limit=1e9) - centre(0.0, wrench_limit=1e9) < 0.3 * moved
-    assert simulator.WRENCH_LIMIT <= 15.0
+    assert simulator.WRENCH_LIMIT <= 0.08 * N * 9.81  # of the weight
 
 
 def test_standing_on_a_box():
@@ -763,7 +832,9 @@ def test_nearest_prior():
     moved = np.einsum("ij,tkj->tki", turn.as_matrix(), x[49:52]) + [3.0, -2.0, 0.0]
     state = State(moved[1], (moved[1] - moved[0]) / STEP, q[1])
     got, rotation = p.mode(state)
-    np.testing.assert_allclose(got, moved[2], atol=1e-6)
+    rest = np.setdiff1d(np.arange(N), LEGS[1:].ravel())
+    np.testing.assert_allclose(got[rest], moved[2][rest], atol=1e-6)
+    np.testing.assert_allclose(got, moved[2], atol=0.01)  # planted: the standing foot does not move at all
     np.testing.assert_allclose(quat_matrix(rotation), quat_matrix(q[2]), atol=1e-6)
     # nearest, against a loop over the whole features
     f = p.features(state.x[None], state.v[None], state.quat[None])[0]
@@ -779,6 +850,31 @@ def test_nearest_prior():
     with pytest.raises(ValueError, match="three frames"):
         NearestPrior([(x[:2], quat[:2])])
     assert NearestPrior([motion()], floor=Plane(offset=0.2)).ground(np.full((N, 3), 2.0)) == pytest.approx(0.2)
+
+
+def test_plant():
+    """A foot in contact stays, one that swings clears the floor, bones keep their lengths, the rest does not move."""
+    x, _ = motion()
+    held = prior_module.contacts_of(x)
+    assert 0.3 < held.mean() < 0.7 and held.shape == (len(x), 4)
+    slow = np.linalg.norm(np.diff(x[:, FEET, :2], axis=0), axis=-1) / STEP
+    low = x[:, FEET, 2] - RADII[FEET]
+    for t in range(1, len(x), 7):
+        want = (low[t] < 0.03) & (low[t - 1] < 0.03) & (slow[t - 1] < 0.5)
+        np.testing.assert_array_equal(held[t], want)
+    t = int(np.flatnonzero(held[:, 1] & ~held[:, 2:].any(axis=1))[3])  # on the left ball alone
+    slid = x[t + 1] + [0.02, -0.01, 0.0]
+    out = prior_module.plant(x[t], slid[None], held[t][None])[0]
+    np.testing.assert_allclose(out[FEET[1], :2], x[t, FEET[1], :2], atol=1e-3)
+    assert np.linalg.norm((slid - x[t])[FEET[1], :2]) > 0.015
+    np.testing.assert_allclose(np.linalg.norm(DIFFERENCE @ out, axis=-1), LENGTHS, rtol=1e-6)
+    rest = np.setdiff1d(np.arange(N), LEGS[1:].ravel())
+    np.testing.assert_array_equal(out[rest], slid[rest])
+    none = prior_module.plant(STAND, STAND[None], np.zeros((1, 4), bool))[0]
+    gap = (none - STAND)[FEET, 2] + (STAND[FEET, 2] - RADII[FEET])
+    np.testing.assert_allclose(gap, prior_module.CLEAR, atol=1e-3)
+    raised = prior_module.plant(x[t] + [0, 0, 0.5], slid[None] + [0, 0, 0.5], held[t][None], 0.5)[0]
+    np.testing.assert_allclose(raised, out + [0, 0, 0.5], atol=1e-9)
 
 
 # ------------------------------------------------------------------------------------ what goes wrong
@@ -865,7 +961,7 @@ def test_bad_settings():
     """What a simulator cannot be made with: one line each."""
     for wrong, words in (
         ({"samples": 0}, "samples 0"), ({"samples": -1}, "samples -1"), ({"samples": 1.5}, "samples 1.5"),
-        ({"samples": True}, "samples True"), ({"iterations": 0}, "iterations 0"), ({"inside": "x"}, "always, never"),
+        ({"samples": True}, "samples True"), ({"iterations": 0}, "iterations 0"), ({"start": "x"}, "mode, y"),
         ({"obstacles": ()}, "no obstacles"), ({"weights": Weights(contact=-1.0)}, "contact -1"),
         ({"weights": Weights(prior=np.nan)}, "prior nan"), ({"wrench_limit": -1.0}, "wrench_limit -1"),
         ({"wrench_weight": 0.0}, "wrench_weight 0"), ({"wrench_weight": np.inf}, "wrench_weight inf"),

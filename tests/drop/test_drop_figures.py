@@ -140,7 +140,8 @@ def short(monkeypatch, frames):
 def test_ablations(monkeypatch):
     """Each switch does what §8.3 says: no prior lies down, no contact sinks, no correction leaves the wrench."""
     short(monkeypatch, 55)
-    takes = {t.name: t for t in figures.ablations(figures.Options(newton=60.0))}
+    monkeypatch.setattr(figures, "ABLATION", 100.0)
+    takes = {t.name: t for t in figures.ablations(figures.Options())}
     assert set(takes) == {"whole", "no prior", "no range of motion", "no contact", "no correction"}
     low = lambda t: min(s[0].x[0, 2] for s in takes[t].states)  # noqa: E731
     assert low("no prior") < 0.4 < low("whole")
