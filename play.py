@@ -350,7 +350,7 @@ def figure_options(opt: Options, argv) -> Options:
         raise UserError(f"--figure {opt.figure}: has its own policies, streamed: leave out --{', --'.join(wrong)}")
     paths = [Path(os.path.relpath(CHARACTERS / f"{name}.npz")) for name in FIGURES[opt.figure]]
     if gone := [p for p in paths if not p.is_file()]:
-        make = f"python -m extras.arms run {gone[0].stem}, then python -m extras.policies ship"
+        make = f"python -m extras.arms run {gone[0].stem}, then python -m extras.arms ship"
         raise UserError(f"--figure {opt.figure}: no policy {gone[0]}; train one: {make}")
     clips = opt.clips if given & {"motion", "clips"} else USER
     png = opt.png or (None if opt.video else f"figure-{opt.figure}.png")
