@@ -196,6 +196,8 @@ class Stage:
         """The prior asked for; a clip's prior follows the clip the take starts from."""
         if self.opt.prior == "clip":
             return ClipPrior(x, quat, at)
+        if self.general:
+            self.general.floor = None  # an earlier demonstration may have tilted it
         return self.general and Rising(self.general, self.opt.rise)
 
     def wrench_limit(self, x):
