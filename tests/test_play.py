@@ -265,7 +265,7 @@ def test_which_policy(policy_file, tmp_path, monkeypatch, char, ref):
     assert metrics.find_policy(play.Options())[1] == tmp_path / "jesse.npz"  # shipped beside the character
     elsewhere = tmp_path / "mine" / "bob.toml"
     elsewhere.parent.mkdir()
-    with pytest.raises(UserError, match="no character .*mine/bob.toml"):
+    with pytest.raises(UserError, match="no file .*mine/bob.toml"):
         metrics.find_policy(play.Options(character=str(elsewhere)))
     elsewhere.write_text((tmp_path / "jesse.toml").read_text())
     (elsewhere.parent / "jesse.xml").write_bytes((tmp_path / "jesse.xml").read_bytes())
