@@ -131,7 +131,9 @@ def lowered(full):
     """
     a = full[RECOVERY[0] : RECOVERY[1]]
     with np.errstate(invalid="ignore"):
-        return float(np.nanmean(1.0 - a[:, 0] / a[:, 1]))  # a frame in which everybody lies has none
+        share = 1.0 - a[:, 0] / a[:, 1]
+    found = share[np.isfinite(share)]  # a frame in which everybody lies has none
+    return float(found.mean()) if len(found) else float("nan")
 
 
 def claims(full, bare):
