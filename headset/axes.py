@@ -285,7 +285,7 @@ def beginning(path, devices=3, seconds=SECONDS[1]) -> list[Sample]:
     return out
 
 
-def told(path, devices=3) -> str | None:
+def axes_in(path, devices=3) -> str | None:
     """The axes that a file's own first lines tell, as those of a recording of the page.  None: it tells none of AXES
 
     Raises    UserError: as `Reader`
@@ -312,7 +312,7 @@ def choose(path, wanted="auto", grip=None, unit=None, order=(0, 1, 2), devices=3
         raise UserError(f"--axes {wanted}: unknown; valid: auto, {', '.join(AXES)}")
     if is_live(path) or wanted == "auto" and is_replay(path):
         return Choice("unity" if wanted == "auto" else wanted, grip, unit, tuple(order), [])
-    if wanted == "auto" and (own := told(path, devices)):
+    if wanted == "auto" and (own := axes_in(path, devices)):
         return Choice(own, grip, unit, tuple(order), [f"axes as the file itself says: --axes {own}"])
     samples = beginning(path, devices)
     if devices == 3 and lie(samples):  # until somebody takes them

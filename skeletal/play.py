@@ -155,20 +155,28 @@ def retarget(argv) -> int:
     else:
         to, other = read(opt.target)
         target = other.skeleton
-    out = net(m, source, target, to)
+    way = f"structure {'AB'[source]} -> {'AB'[to]}"
+    finish(opt, m, net(m, source, target, to), net.domains[to].structure, way, "retargeted")
+    return 0
+
+
+def finish(opt, m, out, structure, way, label):
+    """Clean the feet if asked to, say how far they slide, and write and draw what is wanted.
+
+    Args      m, out : source and result; structure : to write it with; way : from what to what; label : in pictures
+    Test      tests/skeletal/test_skeletal_play.py::test_retarget_command"""
     standing = data.contacts(m)
     before = data.sliding(out, standing)
     if opt.clean:
         out = data.clean_feet(out, standing)
     after = data.sliding(out, standing)
-    print(f"{opt.source}: {len(m)} frames, structure {'AB'[source]} -> {'AB'[to]}; feet slide {100 * before:.1f} cm/s, "
+    print(f"{opt.source}: {len(m)} frames, {way}; feet slide {100 * before:.1f} cm/s, "
           f"after the clean-up {100 * after:.1f}; source {100 * data.sliding(m, standing):.1f}")  # fmt: skip
     if opt.out:
-        data.write_motion(opt.out, out, net.domains[to].structure)
+        data.write_motion(opt.out, out, structure)
     if opt.png or opt.video:
-        draw([m, out], ["source", "retargeted"], opt.png, opt.video, opt.every)
+        draw([m, out], ["source", label], opt.png, opt.video, opt.every)
     print(*filter(None, (opt.out, opt.png, opt.video)), sep="\n")
-    return 0
 
 
 def target_body(net: Correction, target, up, drop):
@@ -198,18 +206,8 @@ def onto_rig(opt, net: Correction) -> int:
     source = net.index("human")
     m = data.to_motion(rigs.human_raw(clip), net.sides[source].rig.structure)
     B = net.sides[to].rig
-    out, standing = net(m, source, body, to), data.contacts(m)
-    before = data.sliding(out, standing)
-    if opt.clean:
-        out = data.clean_feet(out, standing)
-    after = data.sliding(out, standing)
-    print(f"{opt.source}: {len(m)} frames, human -> {B.name}; feet slide {100 * before:.1f} cm/s, "
-          f"after the clean-up {100 * after:.1f}; source {100 * data.sliding(m, standing):.1f}")  # fmt: skip
-    if opt.out:
-        data.write_motion(opt.out, out, replace(B.structure, up="y", unit=0.01))
-    if opt.png or opt.video:
-        draw([m, out], ["source", B.name], opt.png, opt.video, opt.every)
-    print(*filter(None, (opt.out, opt.png, opt.video)), sep="\n")
+    in_file = replace(B.structure, up="y", unit=0.01)
+    finish(opt, m, net(m, source, body, to), in_file, f"human -> {B.name}", B.name)
     return 0
 
 

@@ -1,6 +1,6 @@
 // Beat Saber's replays, *.bsor of BeatLeader.  Twin of headset/bsor.py, name by name; the format is described there.
 
-import { DEVICES, UserError } from './reader.js';
+import { DEVICES, PARTS, UserError } from './reader.js';
 
 const [MAGIC, VERSION] = [[0x69, 0x3d, 0x2d, 0x44], 1];
 const SECTIONS = ['info', 'frames', 'notes', 'walls', 'heights', 'pauses'];
@@ -10,7 +10,6 @@ const INFO = [ // name, and the kind; s: a string
   ...STRINGS.map((name) => [name, 's']), ['score', 'i'], ['mode', 's'], ['environment', 's'], ['modifiers', 's'],
   ['jump distance', 'f'], ['left-handed', 'B'], ['height', 'f'], ['start time', 'f'], ['fail time', 'f'], ['speed', 'f'],
 ];
-const PARTS = ['px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw'];
 const FRAME = 8 + 4 * DEVICES.length * PARTS.length; // bytes: time, frames a second, poses
 const [NOTE, CUT] = [16, 72]; // bytes of a note's event, and of the cut that follows one of kind 0 or 1
 const SIZES = { walls: 16, heights: 8, pauses: 12 };

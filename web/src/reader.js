@@ -5,7 +5,7 @@ import { cross, distance, heading, quatAbout, quatConj, quatMul, quatRotate, qua
 export class UserError extends Error {} // plumbing.cli.UserError: one line for the person at the page
 
 export const DEVICES = ['head', 'left', 'right'];
-const PARTS = ['px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw'];
+export const PARTS = ['px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw'];
 export const COLUMNS = ['time', ...DEVICES.flatMap((d) => PARTS.map((p) => `${d}_${p}`))];
 export const SAMPLE_RATE = 90; // Hz, of a stream without times
 const LINE_LIMIT = 65536;
@@ -60,7 +60,11 @@ export function columns(names, wanted) { // reader.columns: as they stand, loose
   const ways = [names.map((n) => column(n)), names.map((n) => column(n, true)),
     withoutPrefix(names).map((n) => column(n, true))];
   const twice = (way) => way.some((c, i) => c && c !== 'time' && way.indexOf(c) !== i);
-  return ways.find((way) => wanted.every((c) => told(way).has(c)) && !twice(way)) ?? ways[0];
+  const whole = (way) => {
+    const there = told(way);
+    return wanted.every((c) => there.has(c));
+  };
+  return ways.find((way) => whole(way) && !twice(way)) ?? ways[0];
 }
 
 function told(known) { // reader.told: the columns that are there, those of a matrix among them
@@ -208,7 +212,8 @@ export class Reader { // reader.Reader, of files: a line that cannot be read is 
     const entries = used.map((d) => [0, 1, 2].flatMap((i) => [0, 1, 2, 3].map((j) => `${d}_m${i}${j}`)));
     this.matrices = entries.map((names, k) => [k, names.map((c) => known.indexOf(c))])
       .filter(([, at]) => at.every((i) => i >= 0));
-    const missing = this.wanted.slice(1).filter((c) => !told(known).has(c));
+    const there = told(known);
+    const missing = this.wanted.slice(1).filter((c) => !there.has(c));
     const twice = known.find((c, i) => c && c !== 'time' && known.indexOf(c) !== i);
     if (twice) this.fail(`, line ${this.line}: column ${twice} is there twice; valid: once each`);
     if (missing.length) {
