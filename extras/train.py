@@ -61,7 +61,7 @@ class Options(ppo.Options):
     retry: float = arg(0.0, "share of episodes that start up to 2 s before a place where one failed", check=UNIT)
     stand: float = arg(0.0, "share that start in the default pose under the headset, as a stream does", check=UNIT)
     begin: float = arg(0.0, "share that start so under a user who stands still before a visit", check=UNIT)
-    even: float = arg(0.0, "share of the starts that is shared out evenly among --motion's parts", check=UNIT)
+    kinds: float = arg(0.0, "share of the starts that goes to kinds of motion by how often each fails", check=UNIT)
     players: str | None = arg(
         None, "also the people of a headset's recordings (a folder of .csv files), with bodies (headset/body.py)"
     )
@@ -88,24 +88,25 @@ class Curriculum(Uniform):
               the sequence uniform.  A share `retry` starts RETRY steps before a place where an episode failed of late.
               A share `begin` starts in the still frames before a visit, in sequences drawn by 1 + min(h / ⟨h⟩, MOST)
               with `balance`, evenly without.  Those stand in the default pose, and a share `stand` of all.
-              A share `even` of the time and of the beginnings is the same for every set that sequences come from, and
-              within a set goes by frames × h, of beginnings by min(h / ⟨h⟩, MOST)  (`evened`)
+              A share `kinds` of the time and of the beginnings is shared out among kinds of motion by how often each
+              fails, however much is recorded of it, and within a kind by frames × h, of beginnings by
+              min(h / ⟨h⟩, MOST)  (`by_kind`)
     Symbols   h failures a step, of late (`count`); ⟨h⟩ its mean over frames; H horizon; T steps of an episode
     Why       after a while most failures are in a few sequences, and a uniform draw spends its steps on the others;
               within them they are at a few places, such as the first steps of a run.  And a policy that has always been
               put into mid-motion has never set off.  What has few recordings is not what users do seldom: sixty
               gestures and steps backwards beside nine hundred walks and runs were one start in thirty, and not learnt
     Note      with `balance` a failure of a start in the default pose counts as one of the sequence that it was in
-    Test      tests/extras/test_train.py::test_balanced_starts, test_retried_starts, test_begun_starts, test_even_starts
+    Test      tests/extras/test_train.py::test_balanced_starts, test_retried_starts, test_begun_starts, test_kinds_of_starts
     """
 
     def __init__(
-        self, ref: Reference, horizon=EPISODE_STEPS, balance=False, retry=0.0, stand=0.0, begin=0.0, even=0.0, sets=None
+        self, ref: Reference, horizon=EPISODE_STEPS, balance=False, retry=0.0, stand=0.0, begin=0.0, kinds=0.0, kind=None
     ):
-        """sets : (S,) which set each sequence comes from, 0, 1, …  (`set_of`); all from one by default"""
+        """kind : (S,) of each sequence, 0, 1, …  (`kind_of`); all of one by default"""
         super().__init__(ref)
         self.horizon, self.balance, self.retry, self.stand, self.begin = horizon, balance, retry, stand, begin
-        self.even, self.sets = even, np.zeros(len(ref.first), int) if sets is None else np.asarray(sets)
+        self.kinds, self.kind = kinds, np.zeros(len(ref.first), int) if kind is None else np.asarray(kind)
         self.failed = np.full(len(ref.first), 0.5)  # of each sequence, failures and steps lived, of late
         self.lived = np.full(len(ref.first), float(horizon))
         self.lost = np.zeros(PLACES, int)  # frames at which episodes failed of late; 0: none yet
@@ -115,7 +116,7 @@ class Curriculum(Uniform):
 
     def draw(self, rng, n):
         """As `Uniform.draw`: frames (n,), and which start in the default pose (n,) bool."""
-        f = self.balanced(rng, n) if self.balance or self.even else rng.choice(self.frames, n)
+        f = self.balanced(rng, n) if self.balance or self.kinds else rng.choice(self.frames, n)
         if self.retry:
             place = self.lost[rng.integers(PLACES, size=n)]
             before = place - rng.integers(*RETRY, size=n)
@@ -136,7 +137,7 @@ class Curriculum(Uniform):
         h = np.maximum(self.failed / self.lived, 1e-6)
         steps = -np.expm1(-h * self.horizon) / h  # E[T]
         time = frames * (1.0 + h / np.average(h, weights=frames) if self.balance else steps)
-        cdf = np.cumsum(evened(time, frames * h, self.sets, self.even) / steps)
+        cdf = np.cumsum(by_kind(time, frames * h, frames, self.kind, self.kinds) / steps)
         k = np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right")
         return ref.first[k] + 1 + (frames[k] * rng.random(n)).astype(int)
 
@@ -146,7 +147,7 @@ class Curriculum(Uniform):
         h = np.maximum(self.failed[k] / self.lived[k], 1e-6)
         hard = np.minimum(h / h.mean(), MOST)
         p = 1.0 + hard if self.balance else np.ones(len(k))
-        cdf = np.cumsum(evened(p, hard, self.sets[k], self.even))
+        cdf = np.cumsum(by_kind(p, hard, np.ones(len(k)), self.kind[k], self.kinds))
         k = k[np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right").clip(0, len(k) - 1)]
         return ref.first[k] + 1 + (rng.random(n) * (ref.still[k] - 1)).astype(int)
 
@@ -178,16 +179,19 @@ class Curriculum(Uniform):
             getattr(self, name)[:] = value
 
 
-def evened(p, within, sets, share):
-    r"""Weights of which a share is the same for every set, whatever is in it.
+def by_kind(p, failing, size, kind, share):
+    r"""Weights of which a share is divided among kinds of motion, whatever is recorded of each.
 
-    Equation  p' = (1 − share) p / Σ p + share w / (K Σ_{own set} w),  K the sets that have any weight
-    Args      p, within : (S,) weights ≥ 0; sets : (S,) int; share in [0, 1]
+    Equation  p' = (1 − share) p / Σ p + share (r_K / Σ r) f / Σ_K f,  r_K = min(f_K / s_K, MOST ⟨f_K / s_K⟩), f_K and s_K
+              the sums over kind K, ⟨·⟩ the mean over the kinds that have any weight
+    Args      p, failing (f), size (s) : (S,) weights ≥ 0; kind : (S,) int; share in [0, 1]
     Returns   (S,), whose sum is 1
-    Test      tests/extras/test_train.py::test_even_starts"""
-    total = np.bincount(sets, within)
-    own = np.where(total > 0, total, 1.0)[sets] * np.count_nonzero(total)
-    return (1.0 - share) * p / p.sum() + share * within / own
+    Test      tests/extras/test_train.py::test_kinds_of_starts"""
+    total, sizes = np.bincount(kind, failing), np.bincount(kind, size)
+    rate = np.divide(total, sizes, out=np.zeros(len(total)), where=total > 0)
+    rate = np.minimum(rate, MOST * rate[total > 0].mean())
+    own = (rate / rate.sum() / np.where(total > 0, total, 1.0))[kind]
+    return (1.0 - share) * p / p.sum() + share * own * failing
 
 
 class Disturbance:
@@ -271,18 +275,21 @@ def clips_of(opt: Options) -> list:
 CHANGED = re.compile(r"(\+\d+)?(-mirrored.*)?(-visit)?$")  # what stitching, `augment` and `visits` add to a name
 
 
-def set_of(names, opt: Options) -> np.ndarray:
-    """Which part of --motion, or --players, each sequence comes from; what is built in counts as one.
+def kind_of(names, opt: Options) -> np.ndarray:
+    """The kind of motion of each sequence: which part of --motion or --players it is from (what is built in counts as
+    one), and the first word of its name that has no digit: `walk-back` of dataset-1_walk-back_active_001.
 
     Args      names : of sequences, as a Reference has them
-    Returns   (S,) int: 0 what is built in, then 1, 2, … in the order of the folders
-    Test      tests/extras/test_train.py::test_even_starts"""
-    found = {}
+    Returns   (S,) int, 0, 1, … in order of their first appearance
+    Test      tests/extras/test_train.py::test_kinds_of_starts"""
+    found, kinds = {}, {}
     for i, part in enumerate([*data.parts(opt.motion), *([opt.players] if opt.players else [])], 1):
         path = Path(part)
         if part not in data.BUILTIN:
             found |= {f.stem: i for f in (path.rglob("*") if path.is_dir() else [path])}
-    return np.array([found.get(CHANGED.sub("", name), 0) for name in names])
+    recorded = [CHANGED.sub("", name) for name in names]
+    words = [next((w for w in name.split("_") if not re.search(r"\d", w)), "") for name in recorded]
+    return np.array([kinds.setdefault((found.get(n, 0), w), len(kinds)) for n, w in zip(recorded, words, strict=True)])
 
 
 def say(text):
@@ -421,7 +428,7 @@ def make_env(opt: Options) -> Env:
     ref = reference_of(opt, char)
     ref = headset_only(ref) if opt.sensors == "hmd" else ref
     added = {name: getattr(opt, name) for name in ("sensor_offset", "sensor_noise", "push")}
-    starts = {name: getattr(opt, name) for name in ("balance", "retry", "stand", "begin", "even")}
+    starts = {name: getattr(opt, name) for name in ("balance", "retry", "stand", "begin", "kinds")}
     return Env(
         char,
         ref,
@@ -431,7 +438,7 @@ def make_env(opt: Options) -> Env:
         opt.episode,
         disturbance=Disturbance(opt.envs, ref.sensor_pos.shape[1], **added) if any(added.values()) else None,
         asymmetric="asymmetric" not in opt.without,
-        starts=Curriculum(ref, opt.episode, **starts, sets=set_of(ref.names, opt)) if any(starts.values()) else None,
+        starts=Curriculum(ref, opt.episode, **starts, kind=kind_of(ref.names, opt)) if any(starts.values()) else None,
         root_limit=patience(ref, opt.root_limit, opt.root_lag) if opt.root_lag else opt.root_limit,
     )
 

@@ -150,28 +150,34 @@ def test_begun_starts(visited):
         Curriculum(walks, begin=0.4)
 
 
-def test_even_starts(visited, tmp_path):
-    """A share of the draws is the same for every set, whatever it holds; within a set most are where it fails."""
-    p, w, sets = np.array([1.0, 3.0, 4.0, 0.0]), np.array([2.0, 2.0, 1.0, 0.0]), np.array([0, 0, 2, 3])
-    np.testing.assert_allclose(train.evened(p, w, sets, 0.0), p / 8)
-    np.testing.assert_allclose(train.evened(p, w, sets, 1.0), [1 / 4, 1 / 4, 1 / 2, 0])
-    half = (train.evened(p, w, sets, 0) + train.evened(p, w, sets, 1)) / 2
-    np.testing.assert_allclose(train.evened(p, w, sets, 0.5), half)
+def test_kinds_of_starts(visited, tmp_path):
+    """A share of the draws goes to kinds of motion by how often they fail; within a kind most are where it fails."""
+    p, failing, size = np.array([1.0, 3.0, 4.0, 0.0]), np.array([2.0, 2.0, 1.0, 0.0]), np.array([10.0, 30.0, 20.0, 5.0])
+    kind = np.array([0, 0, 2, 3])  # fail 0.1 and 0.05 a unit of size; kind 1 has nobody, kind 3 never fails
+    np.testing.assert_allclose(train.by_kind(p, failing, size, kind, 0.0), p / 8)
+    np.testing.assert_allclose(train.by_kind(p, failing, size, kind, 1.0), [1 / 3, 1 / 3, 1 / 3, 0])
+    half = (train.by_kind(p, failing, size, kind, 0) + train.by_kind(p, failing, size, kind, 1)) / 2
+    np.testing.assert_allclose(train.by_kind(p, failing, size, kind, 0.5), half)
+    twice = [np.concatenate([a, a[:2]]) for a in (p, failing, size, kind)]  # more is recorded of kind 0
+    assert train.by_kind(*twice, 1.0)[kind.tolist().index(2)] == pytest.approx(1 / 3)
+    often = train.by_kind(np.ones(4), np.array([9.0, 0.1, 0.1, 0.1]), np.ones(4), np.arange(4), 1.0)
+    assert often[0] == pytest.approx(train.MOST * 9.3 / 4 / (train.MOST * 9.3 / 4 + 0.3))  # no more, however often
 
     ref, n, rng, owner = visited, 20_000, np.random.default_rng(0), Uniform(visited).owner
     frames = (ref.last - ref.first - 1).astype(float)
     for begin, balance in ((0.0, False), (0.0, True), (1.0, False), (1.0, True)):
-        starts = Curriculum(ref, begin=begin, balance=balance, even=0.6, sets=[0, 1, 1, 0] if begin else [0, 1, 1, 1])
+        starts = Curriculum(ref, begin=begin, balance=balance, kinds=0.6, kind=[0, 1, 1, 0] if begin else [0, 1, 1, 1])
         starts.failed[:], starts.lived[:] = [2, 1, 1, 3], 100.0
         h = starts.failed / 100.0
-        if begin:  # sequences 2 and 3 have still frames; each is a set
+        if begin:  # sequences 2 and 3 have still frames; each is a kind
             base = 1.0 + np.minimum(h[2:] / h[2:].mean(), train.MOST) if balance else np.ones(2)
-            expected = [0, 0, *(0.4 * base / base.sum() + 0.6 * np.array([0.5, 0.5]))]
+            expected = [0, 0, *(0.4 * base / base.sum() + 0.6 * h[2:] / h[2:].sum())]
         else:
             steps = (1.0 - np.exp(-h * starts.horizon)) / h  # of an episode, on average
             time = frames * (1.0 + h / np.average(h, weights=frames)) if balance else frames * steps
-            rest = 0.5 * (frames * h)[1:] / (frames * h)[1:].sum()
-            starts_of = (0.4 * time / time.sum() + 0.6 * np.array([0.5, *rest])) / steps
+            first, rest = h[0], (frames * h)[1:].sum() / frames[1:].sum()  # how often the two kinds fail
+            within = rest * (frames * h)[1:] / (frames * h)[1:].sum()
+            starts_of = (0.4 * time / time.sum() + 0.6 * np.array([first, *within]) / (first + rest)) / steps
             expected = starts_of / starts_of.sum()
         drawn = np.bincount(owner[starts.draw(rng, n)[0]], minlength=4) / n
         np.testing.assert_allclose(drawn, expected, atol=0.015)
@@ -181,7 +187,8 @@ def test_even_starts(visited, tmp_path):
         (tmp_path / name).touch()
     opt = small(tmp_path / "run", motion=f"standing,{tmp_path / 'a'},builtin", players=str(tmp_path / "p_0.csv"))
     names = ["walk_3+7", "x_1+2", "x_1", "y-2_01-mirrored-restyled-speed1.1-h0.9a1.0t1.2-visit", "p_0-visit", "y-2"]
-    np.testing.assert_array_equal(train.set_of(names, opt), [0, 2, 2, 2, 4, 0])
+    names += ["y-2_x_1", "walk_4-mirrored-visit"]  # no file of that name: as what is built in
+    np.testing.assert_array_equal(train.kind_of(names, opt), [0, 1, 1, 2, 3, 4, 5, 0])
 
 
 def test_begun_episodes_stand(char, visited):
@@ -423,12 +430,12 @@ def test_switches_reach_the_environment(tmp_path):
     assert type(plain.starts) is Uniform and plain.disturbance is None and (plain.root_limit == 0.30).all()
     assert motions(plain.ref) == motions(again.ref) == motions(ppo.make_env(opt).ref)
     more = dict(sensor_offset=0.02, sensor_noise=0.01, push=0.3, root_limit=0.5, episode=77, solver="newton")
-    more |= dict(balance=True, stand=0.2, even=0.3, sensors="hmd", without=("contact", "asymmetric"))
+    more |= dict(balance=True, stand=0.2, kinds=0.3, sensors="hmd", without=("contact", "asymmetric"))
     env = train.make_env(replace(opt, **more))
     d, s = env.disturbance, env.starts
     assert (d.sensor_offset, d.sensor_noise, d.push, d.error.shape) == (0.02, 0.01, 0.3, (5, 3, 3))
-    assert (s.balance, s.retry, s.stand, s.begin, s.even, s.horizon) == (True, 0.0, 0.2, 0.0, 0.3, 77)
-    assert len(s.sets) == len(env.ref.names)
+    assert (s.balance, s.retry, s.stand, s.begin, s.kinds, s.horizon) == (True, 0.0, 0.2, 0.0, 0.3, 77)
+    assert len(s.kind) == len(env.ref.names)
     assert (env.n, env.horizon, env.root_limit[0], env.devices, env.asymmetric) == (5, 77, 0.5, 1, False)
     assert {t for t in TERMS if env.char.reward[t][0] == 0} == {"contact"}
     assert env.char.model.opt.iterations == 100 != plain.char.model.opt.iterations
@@ -442,7 +449,7 @@ def test_switches_reach_the_environment(tmp_path):
 def test_resume_is_exact_when_disturbed(tmp_path):
     """The same with everything on that draws random numbers: other users, device errors, pushes."""
     more = "--augment --balance --retry 0.3 --stand 0.3 --begin 0.3 --sensor-offset 0.02 --sensor-noise 0.005".split()
-    more += ["--push", "5", "--even", "0.3"]
+    more += ["--push", "5", "--kinds", "0.3"]
     run(tmp_path / "whole", 4, *more)
     run(tmp_path / "a", 2, *more)
     run(tmp_path / "a", 4, "--resume")
