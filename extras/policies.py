@@ -72,6 +72,19 @@ def _body(meta, path) -> tuple:
     return Path(own.character).stem, own.tail, own.scale, *body
 
 
+TRAINED = "weights trained on "
+
+
+def each_once(licences) -> str:
+    """The terms of several policies in one line: each once, and no set as one of unknown terms whose terms are known.
+
+    Test      tests/extras/test_policies.py::test_each_once"""
+    terms = dict.fromkeys(term for line in licences for term in line.removeprefix(TRAINED).split(f"; {TRAINED}"))
+    known = {term.split(", licensed: ")[0] for term in terms if not term.endswith(data.UNKNOWN)}
+    kept = [t for t in terms if not (t.endswith(data.UNKNOWN) and t.split(", licensed: ")[0] in known)]
+    return "; ".join(TRAINED + term for term in kept)
+
+
 def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     """Write a run's policy for others to play: weights, normaliser, how it was trained, its data's licence.
 
@@ -97,7 +110,7 @@ def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
         raise UserError(f"{run}: does not say how it was trained ({e}); valid: a folder that ppo.py wrote") from None
     sets = data.parts(motion)
     sets += [str(meta["options"]["players"])] if meta["options"].get("players") else []
-    licences = [f"weights trained on {text}" for text in data.licences(sets)]
+    licences = [TRAINED + text for text in data.licences(sets)]
     if "licence" in meta:  # was shipped before
         licences = [str(meta["licence"])] if meta["licence"] != "MIT" else []
     kept = {"policy": meta["policy"], "steps": total_steps(meta), "data": meta["data"]}
@@ -107,9 +120,8 @@ def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     kept |= {"gain": gain} if gain != 1.0 else {}
     if blend:
         kept["blend"] = {"with": [Path(p).name for p in blend], "share": share}
-        older = {str(m["licence"]) for _, m in loaded if m.get("licence", "MIT") != "MIT"}
-        licences += sorted(older - set(licences))
-    kept |= {"licence": "; ".join(licences) or "MIT", "versions": versions(), "git": git_state()}
+        licences += [str(m["licence"]) for _, m in loaded if m.get("licence", "MIT") != "MIT"]
+    kept |= {"licence": each_once(licences) or "MIT", "versions": versions(), "git": git_state()}
     save_checkpoint(path, policy.arrays(), kept)
     return kept
 
@@ -339,12 +351,12 @@ def main(argv=None):
             asked = " ".join(words) or "no command"
             raise UserError(f"{asked}: valid: ship RUN OUT.npz, blend OUT.npz A B …, carry OLD.npz NEW.npz, then flags")
     if what == "carry":
-        opt = cli(Carry, flags, "extras.policies carry", __doc__)
+        opt = cli(Carry, flags, "extras.policies carry OLD.npz NEW.npz", __doc__)
         check_folders(files[1], read=files[:1])
         meta = carry(*files, opt, given_flags(flags))
         print(f"{files[1]}: {meta['options']['character']}, {fmt_count(meta['steps'])} steps before")
         return
-    opt = cli(Blend, flags, f"extras.policies {what}", __doc__)
+    opt = cli(Blend, flags, f"extras.policies {what or 'ship|blend|carry'} FILE …", __doc__)
     if what == "ship" and "share" in given_flags(flags):
         raise UserError("--share is of blend OUT.npz A B …: leave it out")
     run, out, *others = files if what == "ship" else [files[1], files[0], *files[2:]]

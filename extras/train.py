@@ -97,12 +97,14 @@ class Curriculum(Uniform):
               put into mid-motion has never set off.  What has few recordings is not what users do seldom: sixty
               gestures and steps backwards beside nine hundred walks and runs were one start in thirty, and not learnt
     Note      with `balance` a failure of a start in the default pose counts as one of the sequence that it was in
-    Test      tests/extras/test_train.py::test_balanced_starts, test_retried_starts, test_begun_starts, test_kinds_of_starts
+    Test      tests/extras/test_train.py::test_balanced_starts, test_retried_starts, test_begun_starts,
+              test_kinds_of_starts
     """
 
     def __init__(
-        self, ref: Reference, horizon=EPISODE_STEPS, balance=False, retry=0.0, stand=0.0, begin=0.0, kinds=0.0, kind=None
-    ):
+        self, ref: Reference, horizon=EPISODE_STEPS, balance=False, retry=0.0, stand=0.0, begin=0.0, kinds=0.0,
+        kind=None,
+    ):  # fmt: skip
         """kind : (S,) of each sequence, 0, 1, …  (`kind_of`); all of one by default"""
         super().__init__(ref)
         self.horizon, self.balance, self.retry, self.stand, self.begin = horizon, balance, retry, stand, begin
@@ -182,8 +184,8 @@ class Curriculum(Uniform):
 def by_kind(p, failing, size, kind, share):
     r"""Weights of which a share is divided among kinds of motion, whatever is recorded of each.
 
-    Equation  p' = (1 − share) p / Σ p + share (r_K / Σ r) f / Σ_K f,  r_K = min(f_K / s_K, MOST ⟨f_K / s_K⟩), f_K and s_K
-              the sums over kind K, ⟨·⟩ the mean over the kinds that have any weight
+    Equation  p' = (1 − share) p / Σ p + share (r_K / Σ r) f / Σ_K f,  r_K = min(f_K / s_K, MOST ⟨f_K / s_K⟩), f_K and
+              s_K the sums over kind K, ⟨·⟩ the mean over the kinds that have any weight
     Args      p, failing (f), size (s) : (S,) weights ≥ 0; kind : (S,) int; share in [0, 1]
     Returns   (S,), whose sum is 1
     Test      tests/extras/test_train.py::test_kinds_of_starts"""

@@ -139,8 +139,13 @@ def parts(motion) -> list[str]:
     return sets
 
 
+UNKNOWN = "no licence file beside the motion"
+CMU = "free to use, credit CMU Graphics Lab Motion Capture Database (mocap.cs.cmu.edu), funded by NSF EIA-0196217"
+
+
 def licences(sets) -> list[str]:
-    """Of each data set that is not built in: its name, and the first line of the licence file in it, or above its part.
+    """Of each data set that is not built in: its name, and the first line of the licence file in it, or above its part;
+    of a folder without one whose name begins with `cmu`, the credit that CMU asks for.
 
     Test      tests/mocap/test_mocap.py::test_licences, tests/extras/test_policies.py::test_ship
     """
@@ -148,7 +153,8 @@ def licences(sets) -> list[str]:
     for path in (Path(s) for s in sets if s not in BUILTIN):
         whole = path.parent if path.name in ("train", "validation") else path
         notes = [note for folder in (path, whole) if folder.is_dir() for note in sorted(folder.glob("LICENSE*"))]
-        text = notes[0].read_text(errors="replace") if notes else "no licence file beside the motion"
+        absent = CMU if whole.name.lower().startswith("cmu") else UNKNOWN
+        text = notes[0].read_text(errors="replace") if notes else absent
         title = text.strip().split("\n")[0]
         out.append(f"{set_name(path)}, licensed: {title}")
     return out

@@ -48,6 +48,16 @@ def test_ship(tmp_path, monkeypatch):
         policies.ship(tmp_path / "nothing", target)
 
 
+def test_each_once():
+    """An average of averages names a set once, and by its terms where one of them knew them."""
+    a, b, unknown = "a, licensed: X; or Y", "b, licensed: Z", f"a, licensed: {data.UNKNOWN}"
+    line = f"weights trained on {a}; weights trained on {b}"
+    assert policies.each_once([line, line]) == policies.each_once([line]) == line
+    assert policies.each_once([f"weights trained on {unknown}", line]) == line
+    assert policies.each_once([f"weights trained on {unknown}"]) == f"weights trained on {unknown}"
+    assert policies.each_once([]) == ""
+
+
 def test_blended(tmp_path):
     """Shares of 0 and 1 are the two policies; between them weights, and the normaliser's variances, are means."""
     paths = tmp_path / "old", tmp_path / "new"

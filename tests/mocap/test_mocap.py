@@ -801,6 +801,8 @@ def test_licences(tmp_path):
     assert data.licences(["builtin", "standing"]) == []
     (tmp_path / "a" / "train").mkdir()
     assert data.licences([tmp_path / "a" / "train"]) == ["a/train, licensed: Non-commercial."]
+    credited = [f"{name}, licensed: {data.CMU}" for name in ("cmu-inplace/train", "cmu")]
+    assert data.licences(["/x/cmu-inplace/train", "/x/cmu"]) == credited
     assert data.set_name(tmp_path / "a" / "train") == "a/train" and data.set_name("builtin") == "builtin"
 
 
