@@ -43,6 +43,7 @@ from plumbing.cli import (
     given_flags,
     markdown,
     run_main,
+    words_first,
 )
 from plumbing.files import atomic_write, check_folders
 from policy import Policy, check_fits, load_policy, trained_as
@@ -389,9 +390,7 @@ def listed() -> str:
 
 def main(argv=None):
     """List, run, measure or ship arms.  Test: tests/extras/test_arms.py::test_arms_take_turns, test_table, test_ship"""
-    argv = list(argv or [])
-    n = next((k for k, a in enumerate(argv) if a.startswith("-")), len(argv))
-    words, flags = argv[:n], argv[n:]
+    words, flags = words_first(argv)
     if not words and not flags:
         print(listed())
         return

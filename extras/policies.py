@@ -23,7 +23,7 @@ from character import Character
 from env import SENSORS, WITHOUT, observation_terms
 from mocap import data
 from nn import MLP, RunningNorm
-from plumbing.cli import ALL_POSITIVE, POSITIVE, UNIT, UserError, arg, cli, given_flags, run_main, some_of
+from plumbing.cli import ALL_POSITIVE, POSITIVE, UNIT, UserError, arg, cli, given_flags, run_main, some_of, words_first
 from plumbing.files import check_folders
 from plumbing.runs import fmt_count, git_state, save_checkpoint, versions
 from policy import Policy, load_policy, sensors_of, total_steps, trained_as
@@ -341,9 +341,7 @@ WORDS = {"ship": (2, 2), "carry": (2, 2), "blend": (3, 100)}  # how many files e
 
 def main(argv=None):
     """Ship, blend or carry.  Test: tests/extras/test_policies.py::test_carry_command, test_ship, test_wrong_commands"""
-    argv = list(argv or [])
-    n = next((k for k, a in enumerate(argv) if a.startswith("-")), len(argv))
-    words, flags = argv[:n], argv[n:]
+    words, flags = words_first(argv)
     what, files = (words[0], words[1:]) if words else ("", [])
     if not {"-h", "--help"} & set(flags):
         least, most = WORDS.get(what, (1, 0))

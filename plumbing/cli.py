@@ -127,6 +127,15 @@ def cli(dataclass_type, argv, prog, description):
     return dataclass_type(**vars(values))
 
 
+def words_first(argv) -> tuple[list, list]:
+    """A command line's words before its first flag, and the rest.
+
+    Test      tests/extras/test_policies.py::test_wrong_commands, tests/extras/test_arms.py::test_wrong_commands"""
+    argv = list(argv or [])
+    n = next((k for k, a in enumerate(argv) if a.startswith("-")), len(argv))
+    return argv[:n], argv[n:]
+
+
 def given_flags(argv) -> set:
     """Names of the fields whose flags are on a command line, whatever their values.
 
