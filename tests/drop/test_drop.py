@@ -619,6 +619,18 @@ def test_bones_and_wrench_together():
     assert np.abs(free).max() < 0.2
 
 
+def test_nobody_leads_who_has_no_motion():
+    """Eq. 16 draws a body that the prior carries and no rag doll: its step is the one without a direction, to the bit."""
+    sim = Simulator(None)
+    state = state_of(sim)
+    led, free = sim.step(state, v_tar=[2.5, 0.0]), sim.step(state)
+    np.testing.assert_array_equal(led[0].x, free[0].x)
+    assert "direction" not in led[1].energies
+    carried = Simulator(prior(), samples=4)
+    led, free = (carried.step(state, v_tar=v, rng=np.random.default_rng(0))[0] for v in ([2.5, 0.0], None))
+    assert (led.x - free.x)[:, 0].mean() > 1e-3
+
+
 def test_friction_of_limp_joints():
     """The pose is laid on as a rigid body: no force, no torque; whatever a rigid motion did to it is not held back."""
     rng = np.random.default_rng(5)
