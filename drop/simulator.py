@@ -542,7 +542,7 @@ class Simulator:
             return twist_of[choice]
 
         limp = not len(samples)
-        v_tar = None if limp else v_tar  # nobody leads a body that no motion carries: it would be dragged, never at rest
+        v_tar = None if limp else v_tar  # who is carried by no motion is led nowhere: dragged, he would never rest
         slow = limp and at_rest(v_t, here[0])
         friction = (w.stiction if slow else w.friction) if limp else 0.0
         inside = w.inside if len(samples) > 0 and v_tar is None and not pins else 0.0

@@ -620,7 +620,7 @@ def test_bones_and_wrench_together():
 
 
 def test_nobody_leads_who_has_no_motion():
-    """Eq. 16 draws a body that the prior carries and no rag doll: its step is the one without a direction, to the bit."""
+    """Eq. 16 draws a body that the prior carries and no rag doll: its step is the same without, to the bit."""
     sim = Simulator(None)
     state = state_of(sim)
     led, free = sim.step(state, v_tar=[2.5, 0.0]), sim.step(state)
