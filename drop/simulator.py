@@ -508,8 +508,8 @@ class Simulator:
     def step(self, state, force=None, v_tar=None, pins=None, rng=None):
         r"""One step of Algorithm 1.
 
-        Args      state : State; force : (22, 3) [N] or None; v_tar : (2,) [m/s] of Eq. 16; pins : {joint: (3,)} held by
-                  E_constr = (w/2) ‖x_j − x_tar‖² (§8.2); rng : Generator for the samples
+        Args      state : State; force : (22, 3) [N] or None; v_tar : (2,) [m/s] of Eq. 16, nothing to a body without
+                  samples; pins : {joint: (3,)} held by E_constr = (w/2) ‖x_j − x_tar‖² (§8.2); rng : Generator for them
         Returns   State, Outcome
         Raises    ValueError: a state, force, target or prior's output that is not finite or has a wrong shape
         """
@@ -545,7 +545,7 @@ class Simulator:
         v_tar = None if limp else v_tar  # who is carried by no motion is led nowhere: dragged, he would never rest
         slow = limp and at_rest(v_t, here[0])
         friction = (w.stiction if slow else w.friction) if limp else 0.0
-        inside = w.inside if len(samples) > 0 and v_tar is None and not pins else 0.0
+        inside = w.inside if not limp and v_tar is None and not pins else 0.0
         for iteration in range(self.iterations):
             rhs = y + self.JT @ project_rigidity(x, self.A, self.lengths)
             active = np.zeros(N, bool)
@@ -561,7 +561,7 @@ class Simulator:
                 rhs += limited * x_r
             if friction:
                 rhs += friction * (x_t if slow else project_friction(x, x_t))
-            kinematic = len(samples) > 0 and (iteration > 0 or self.prior_at_first or self.start == "y")
+            kinematic = not limp and (iteration > 0 or self.prior_at_first or self.start == "y")
             if kinematic:
                 rhs += w.prior * samples[choice]
             for j, target in zip(pinned, targets, strict=True):

@@ -79,10 +79,10 @@ def each_once(licences) -> str:
     """The terms of several policies in one line: each once, and no set as one of unknown terms whose terms are known.
 
     Test      tests/extras/test_policies.py::test_each_once"""
-    terms = dict.fromkeys(term for line in licences for term in line.removeprefix(TRAINED).split(f"; {TRAINED}"))
+    joint = f"; {TRAINED}"
+    terms = dict.fromkeys(term for line in licences for term in line.replace(joint, f"\n{TRAINED}").split("\n"))
     known = {term.split(", licensed: ")[0] for term in terms if not term.endswith(data.UNKNOWN)}
-    kept = [t for t in terms if not (t.endswith(data.UNKNOWN) and t.split(", licensed: ")[0] in known)]
-    return "; ".join(TRAINED + term for term in kept)
+    return "; ".join(t for t in terms if not (t.endswith(data.UNKNOWN) and t.split(", licensed: ")[0] in known))
 
 
 def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:

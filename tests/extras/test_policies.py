@@ -55,6 +55,7 @@ def test_each_once():
     assert policies.each_once([line, line]) == policies.each_once([line]) == line
     assert policies.each_once([f"weights trained on {unknown}", line]) == line
     assert policies.each_once([f"weights trained on {unknown}"]) == f"weights trained on {unknown}"
+    assert policies.each_once(["any other terms", line]) == f"any other terms; {line}"
     assert policies.each_once([]) == ""
 
 
