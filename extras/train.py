@@ -45,9 +45,10 @@ LATE = 1.5  # ASSUMED: s for which a fast user excuses that the character is lat
 MOST = 2.0  # ASSUMED: a beginning that fails more often than so many times the mean is drawn no more often for it
 SHORTEST = 1.0  # s of a clip that is made a visit
 RUNS = 2.0  # m/s, ASSUMED: a stitched sequence with a faster second is made visits, too
+FEW, MORE = 100, 2  # ASSUMED: visits of parts of --motion that have fewer clips are made by so many more other users
 PLAYERS_STAND = 1.5  # ASSUMED: s at a recording's beginning in which a player stands well enough to start under
 PUSH_SECONDS = 2.0  # mean time between pushes
-CODE = 3  # counts up when retargeting or augmenting changes what it makes: older caches are then made anew
+CODE = 4  # counts up when retargeting or augmenting changes what it makes: older caches are then made anew
 CHUNK = 100  # clips retargeted between two lines of progress
 
 
@@ -89,7 +90,7 @@ class Curriculum(Uniform):
               A share `begin` starts in the still frames before a visit, in sequences drawn by 1 + min(h / ⟨h⟩, MOST)
               with `balance`, evenly without.  Those stand in the default pose, and a share `stand` of all.
               A share `kinds` of the time and of the beginnings is shared out among kinds of motion by how often each
-              fails, however much is recorded of it, and within a kind by frames × h, of beginnings by
+              fails, times the square root of its frames, and within a kind by frames × h, of beginnings by
               min(h / ⟨h⟩, MOST)  (`by_kind`)
     Symbols   h failures a step, of late (`count`); ⟨h⟩ its mean over frames; H horizon; T steps of an episode
     Why       after a while most failures are in a few sequences, and a uniform draw spends its steps on the others;
@@ -182,16 +183,18 @@ class Curriculum(Uniform):
 
 
 def by_kind(p, failing, size, kind, share):
-    r"""Weights of which a share is divided among kinds of motion, whatever is recorded of each.
+    r"""Weights of which a share is divided among kinds of motion, by how often each fails and the square root of
+    how much is recorded of it.
 
-    Equation  p' = (1 − share) p / Σ p + share (r_K / Σ r) f / Σ_K f,  r_K = min(f_K / s_K, MOST ⟨f_K / s_K⟩), f_K and
-              s_K the sums over kind K, ⟨·⟩ the mean over the kinds that have any weight
+    Equation  p' = (1 − share) p / Σ p + share (r_K / Σ r) f / Σ_K f,  r_K = √s_K min(f_K / s_K, MOST ⟨f_K / s_K⟩),
+              f_K and s_K the sums over kind K, ⟨·⟩ the mean over the kinds that have any weight
+    Why       √s_K: kinds of one or two captures that fail whatever is done would take nearly half of the share
     Args      p, failing (f), size (s) : (S,) weights ≥ 0; kind : (S,) int; share in [0, 1]
     Returns   (S,), whose sum is 1
     Test      tests/extras/test_train.py::test_kinds_of_starts"""
     total, sizes = np.bincount(kind, failing), np.bincount(kind, size)
     rate = np.divide(total, sizes, out=np.zeros(len(total)), where=total > 0)
-    rate = np.minimum(rate, MOST * rate[total > 0].mean())
+    rate = np.minimum(rate, MOST * rate[total > 0].mean()) * np.sqrt(sizes)
     own = (rate / rate.sum() / np.where(total > 0, total, 1.0))[kind]
     return (1.0 - share) * p / p.sum() + share * own * failing
 
@@ -247,15 +250,17 @@ class Disturbance:
 
 def clips_of(opt: Options) -> list:
     """The stitched training sequences; with `augment` twice, with `visits` every single clip as a visit, too, and every
-    sequence that runs: a run of two seconds is over before its user has sped up.
+    sequence that runs: a run of two seconds is over before its user has sped up.  Visits of parts of --motion that have
+    fewer than FEW clips are made by MORE other users.
 
     Test      tests/extras/test_train.py::test_clips"""
-    reading, single, clips, runs = Reading.of(opt), [], [], []
+    reading, single, clips, runs, few = Reading.of(opt), [], [], [], []
     for each in data.parts(opt.motion):  # as `data.sequences`, but the single clips are wanted, too, and read once
         say(f"reading {each}")
         found = data.load(each, clips=opt.clips, split="train", reading=reading)
         made = data.stitched(found, f"{each} [train]", opt.seed)
         single, clips, once = single + found, clips + made, set(map(id, found))
+        few += found if len(found) < FEW else []
         runs += [c for c in made if id(c) not in once and augment.fastest_second(c) > RUNS]
     if opt.augment:
         say(f"augmenting {len(clips)} sequences")
@@ -266,6 +271,10 @@ def clips_of(opt: Options) -> list:
             raise UserError(f"--motion {opt.motion}: no clip of {SHORTEST:g} s or more to make a visit of")
         say(f"making visits of {len(single)} clips")
         clips = clips + augment.visits(single, np.random.default_rng([opt.seed, 5]))
+        few = [c for c in few if c.seconds >= SHORTEST]
+        for k in range(MORE if few else 0):
+            again = augment.visits(few, np.random.default_rng([opt.seed, 7, k]))
+            clips += again[len(again) // 2 :]  # the other users' half
     if opt.players:
         say(f"bodies for the recordings of {opt.players}")
         people = body.players(opt.players)
@@ -279,7 +288,8 @@ CHANGED = re.compile(r"(\+\d+)?(-mirrored.*)?(-visit)?$")  # what stitching, `au
 
 def kind_of(names, opt: Options) -> np.ndarray:
     """The kind of motion of each sequence: which part of --motion or --players it is from (what is built in counts as
-    one), and the first word of its name that has no digit: `walk-back` of dataset-1_walk-back_active_001.
+    one), the first word of its name that has no digit, `walk-back` of dataset-1_walk-back_active_001, and whether it is
+    played backwards (`augment.reverse`).
 
     Args      names : of sequences, as a Reference has them
     Returns   (S,) int, 0, 1, … in order of their first appearance
@@ -291,7 +301,11 @@ def kind_of(names, opt: Options) -> np.ndarray:
             found |= {f.stem: i for f in (path.rglob("*") if path.is_dir() else [path])}
     recorded = [CHANGED.sub("", name) for name in names]
     words = [next((w for w in name.split("_") if not re.search(r"\d", w)), "") for name in recorded]
-    return np.array([kinds.setdefault((found.get(n, 0), w), len(kinds)) for n, w in zip(recorded, words, strict=True)])
+    keys = [
+        (found.get(short, 0), word, "-reversed" in name)
+        for name, short, word in zip(names, recorded, words, strict=True)
+    ]
+    return np.array([kinds.setdefault(key, len(kinds)) for key in keys])
 
 
 def say(text):

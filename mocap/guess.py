@@ -13,6 +13,7 @@ from human import FEET, PARENTS, SEG, SEGMENTS, linear_velocity, quat_conj, quat
 from mocap import bvh
 from mocap.rigs import (
     RIGS,
+    UNITS,
     UPS,
     Rig,
     axes_of,
@@ -27,6 +28,8 @@ from mocap.rigs import (
 )
 from plumbing.cli import UserError, printable
 from plumbing.files import read_toml
+
+CHARACTER = (0.2, 1.5)  # m, ASSUMED: hips of a character; its own file is taken for one of ours, in cm, within
 
 # ------------------------------------------------------------------------------------ which joint is which segment
 
@@ -322,7 +325,13 @@ def unknown_rig(b, group, reading):
     pos = np.concatenate([p[:, at] for _, p, _ in poses])[..., order] * signs
     if not unit:
         unit, name, hips = find_unit(pos)
-        say(b.path, unit_line(unit, name, hips), warning=not name)
+        if CHARACTER[0] <= hips * UNITS["cm"] <= CHARACTER[1] and all(
+            joint == segment for segment, joint in joints.items() if segment[-2] == "_"
+        ):  # as retarget.write_bvh calls them
+            unit = UNITS["cm"]
+            say(b.path, f"unit cm: the joints are called as in a character's file; hips {hips * unit:.2f} m", False)
+        else:
+            say(b.path, unit_line(unit, name, hips), warning=not name)
     rig = Rig(joints, {}, balls, unit=unit, up=up)
     human = [
         human_clip(rig, np.tile([1.0, 0, 0, 0], (15, 1)), *p, "", "", 1.0 / e.frame_time) for p, e in zip(poses, group)

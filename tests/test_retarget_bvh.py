@@ -14,9 +14,9 @@ from mocap import bvh, data, humanoid
 from plumbing.cli import UserError
 
 
-def exported(path, seconds=3.0):
+def exported(path, name="jesse", seconds=3.0):
     """A walk's kinematic pose written as BVH.  -> character, pose, clip"""
-    char, clip = character.load("jesse"), clip_of("walk", seconds, turn_rate=0.5)
+    char, clip = character.load(name), clip_of("walk", seconds, turn_rate=0.5)
     pose = retarget.retarget(char, clip)
     retarget.write_bvh(path, char, pose.qpos, clip.rate)
     return char, pose, clip
@@ -41,7 +41,12 @@ def test_bvh_round_trip(tmp_path):
 
 
 def test_bvh_is_a_human_again(tmp_path, capsys):
-    """The character's own file, read as a human of an unknown rig."""
+    """The character's own file, read as a human of an unknown rig, in its own size: Oppy's hips are no adult's."""
+    for name in ("oppy", "dino"):
+        char = exported(tmp_path / f"{name}.bvh", name)[0]
+        small = data.from_bvh(tmp_path / f"{name}.bvh")
+        assert "unit cm" in capsys.readouterr().err
+        assert small.hip_height == pytest.approx(char.hip_height, rel=0.2)
     char, pose, clip = exported(tmp_path / "walk.bvh")
     got = data.from_bvh(tmp_path / "walk.bvh")
     assert "unit cm" in capsys.readouterr().err

@@ -155,11 +155,12 @@ def test_kinds_of_starts(visited, tmp_path):
     p, failing, size = np.array([1.0, 3.0, 4.0, 0.0]), np.array([2.0, 2.0, 1.0, 0.0]), np.array([10.0, 30.0, 20.0, 5.0])
     kind = np.array([0, 0, 2, 3])  # fail 0.1 and 0.05 a unit of size; kind 1 has nobody, kind 3 never fails
     np.testing.assert_allclose(train.by_kind(p, failing, size, kind, 0.0), p / 8)
-    np.testing.assert_allclose(train.by_kind(p, failing, size, kind, 1.0), [1 / 3, 1 / 3, 1 / 3, 0])
+    a, b = 4 / 40 * np.sqrt(40), 1 / 20 * np.sqrt(20)
+    np.testing.assert_allclose(train.by_kind(p, failing, size, kind, 1.0), np.array([a / 2, a / 2, b, 0]) / (a + b))
     half = (train.by_kind(p, failing, size, kind, 0) + train.by_kind(p, failing, size, kind, 1)) / 2
     np.testing.assert_allclose(train.by_kind(p, failing, size, kind, 0.5), half)
-    twice = [np.concatenate([a, a[:2]]) for a in (p, failing, size, kind)]  # more is recorded of kind 0
-    assert train.by_kind(*twice, 1.0)[kind.tolist().index(2)] == pytest.approx(1 / 3)
+    twice = [np.concatenate([x, x[:2]]) for x in (p, failing, size, kind)]  # twice as much is recorded of kind 0
+    assert train.by_kind(*twice, 1.0)[kind.tolist().index(2)] == pytest.approx(b / (np.sqrt(2) * a + b))
     often = train.by_kind(np.ones(4), np.array([9.0, 0.1, 0.1, 0.1]), np.ones(4), np.arange(4), 1.0)
     assert often[0] == pytest.approx(train.MOST * 9.3 / 4 / (train.MOST * 9.3 / 4 + 0.3))  # no more, however often
 
@@ -175,7 +176,7 @@ def test_kinds_of_starts(visited, tmp_path):
         else:
             steps = (1.0 - np.exp(-h * starts.horizon)) / h  # of an episode, on average
             time = frames * (1.0 + h / np.average(h, weights=frames)) if balance else frames * steps
-            first, rest = h[0], (frames * h)[1:].sum() / frames[1:].sum()  # how often the two kinds fail
+            first, rest = h[0] * np.sqrt(frames[0]), (frames * h)[1:].sum() / np.sqrt(frames[1:].sum())
             within = rest * (frames * h)[1:] / (frames * h)[1:].sum()
             starts_of = (0.4 * time / time.sum() + 0.6 * np.array([first, *within]) / (first + rest)) / steps
             expected = starts_of / starts_of.sum()
@@ -187,8 +188,8 @@ def test_kinds_of_starts(visited, tmp_path):
         (tmp_path / name).touch()
     opt = small(tmp_path / "run", motion=f"standing,{tmp_path / 'a'},builtin", players=str(tmp_path / "p_0.csv"))
     names = ["walk_3+7", "x_1+2", "x_1", "y-2_01-mirrored-restyled-speed1.1-h0.9a1.0t1.2-visit", "p_0-visit", "y-2"]
-    names += ["y-2_x_1", "walk_4-mirrored-visit"]  # no file of that name: as what is built in
-    np.testing.assert_array_equal(train.kind_of(names, opt), [0, 1, 1, 2, 3, 4, 5, 0])
+    names += ["y-2_x_1", "walk_4-mirrored-visit", "walk_4-mirrored-reversed-visit"]  # no file's: as what is built in
+    np.testing.assert_array_equal(train.kind_of(names, opt), [0, 1, 1, 2, 3, 4, 5, 0, 6])
 
 
 def test_begun_episodes_stand(char, visited):
@@ -291,6 +292,10 @@ def test_clips(tmp_path, capsys):
         visits = train.clips_of(small(**more))[1:]
         assert len(visits) >= 2 and all(c.name.endswith("-visit") and c.still > 1 for c in visits)
     assert "making visits of 1 clips" in capsys.readouterr().out
+    # the clip, its visit, the other user's, and those of MORE users for one of a few; each part of 15 s, each another
+    names = [c.name for c in train.clips_of(small(begin=0.1))[1:]]
+    others = [n for n in names if "mirrored" in n]
+    assert len(others) == (1 + train.MORE) * (len(names) - len(others)) and len(set(others)) == len(others)
 
 
 def test_patience(ref):
