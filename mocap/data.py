@@ -25,6 +25,7 @@ import numpy as np
 
 from human import Clip, resample
 from mocap import bvh, gait
+from mocap.augment import reverse
 from mocap.guess import unknown_rig
 from mocap.rigs import (
     AS_IT_IS,
@@ -94,8 +95,8 @@ PROTOCOL1 = """
 91_06 91_36 91_37 91_42 91_43 91_45 93_06 94_16
 """
 NAMED = {"protocol1": frozenset(PROTOCOL1.split())}  # sets of clips that --clips knows by name
-BUILTIN = {"builtin": gait.MIX, "standing": gait.STANDING}  # the data sets that need no download
-MOTION = "builtin, standing, a .bvh or .amc file, a folder of them, several with commas between them"
+BUILTIN = {"builtin": gait.MIX, "standing": gait.STANDING, "backwards": gait.BACKWARDS}  # no download
+MOTION = "builtin, standing, backwards, a .bvh or .amc file, a folder of them, several with commas between them"
 
 
 @dataclass
@@ -113,7 +114,8 @@ class MotionFlags:
 
 
 def builtin_clips(rate=CONTROL_RATE, seed=0, name="builtin") -> list[Clip]:
-    """The procedural human of mocap/gait.py: people who walk (builtin) or stand and step (standing).
+    """The procedural human of mocap/gait.py: people who walk (builtin), stand and step (standing), or step back
+    (backwards: those who step forwards, `mocap.augment.reverse`d).
 
     Twenty clips, two of them held out by their numbers; and ten more, of every kind and by other people, all held out.
     Test      tests/mocap/test_mocap.py::test_builtin, ::test_joined"""
@@ -125,7 +127,8 @@ def builtin_clips(rate=CONTROL_RATE, seed=0, name="builtin") -> list[Clip]:
     numbers += [105 + 10 * i for i in range(len(held_out))]
     for m, number in zip(library + held_out, numbers, strict=True):
         title = f"{m['name'].split('_')[1]}_{number:03d}"
-        out.append(Clip(title, f"{name}-{number:03d}", m["rate"], m["pos"], m["quat"], m["ball"]))
+        clip = Clip(title, f"{name}-{number:03d}", m["rate"], m["pos"], m["quat"], m["ball"])
+        out.append(replace(reverse(clip), name=f"back_{number:03d}") if name == "backwards" else clip)
     return out
 
 
@@ -178,8 +181,8 @@ def files_of(path: Path) -> list[Path]:
 def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS_IT_IS) -> list[Clip]:
     """Single clips of a data set, at one rate.
 
-    Args      motion : "builtin", "standing", a .bvh or .amc file, or a folder of them (searched below); or several of
-              these with commas between them: each must have what is asked for
+    Args      motion : one of BUILTIN, a .bvh or .amc file, or a folder of them (searched below); or several of these
+              with commas between them: each must have what is asked for
               clips : shell pattern on the names, or one of NAMED
               reading : what the user says about joints, unit and axes of BVH files
               split : train | validation | style | body | all.  A folder of fewer than ten files none of whose names is

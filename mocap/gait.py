@@ -728,13 +728,24 @@ STANDING = (
     ("stop", {"speed": (0.6, 1.2), "sway": (1.0, 2.0)}),
 )
 
+# ASSUMED mix of people who step back, to be played backwards (`mocap.data.builtin_clips`): slower and in shorter steps
+# than they walk.
+BACKWARDS = (
+    ("stop", {"speed": (0.15, 0.3), "cadence": (75.0, 100.0)}),
+    ("stop", {"speed": (0.3, 0.6), "cadence": (80.0, 105.0)}),
+    ("start", {"speed": (0.2, 0.5), "cadence": (75.0, 100.0)}),
+    ("stop", {"speed": (0.2, 0.4), "cadence": (75.0, 100.0), "turn_rate": (-0.25, 0.25)}),
+    ("stop", {"speed": (0.5, 0.8), "cadence": (85.0, 110.0)}),
+)
+
 
 def library(minutes=10.0, rate=30.0, seed=0, mix=MIX):
     r"""An embedded data set: clips of 20 to 40 s of every kind of the mix, byte-identical for a seed.
 
     ASSUMED   the mix and its ranges; speeds grow with the root of the height (equal Froude number)
-    Args      minutes : total length; rate [1/s]; seed : int; mix : MIX or STANDING
-    Returns   list of clips as `generate` returns them; heights 1.5 to 1.9 m; strides within 6 % of the normative ones
+    Args      minutes : total length; rate [1/s]; seed : int; mix : MIX, STANDING or BACKWARDS
+    Returns   list of clips as `generate` returns them; heights 1.5 to 1.9 m; strides within 6 % of the normative ones,
+              where the mix does not say how many steps a minute
     Test      tests/mocap/test_gait.py::test_library_covers_everything, ::test_motions_are_what_they_were
     """
     rng = np.random.default_rng(seed)
@@ -750,7 +761,7 @@ def library(minutes=10.0, rate=30.0, seed=0, mix=MIX):
         if params.get("speed"):
             params["speed"] *= np.sqrt(params["height"] / 1.75)  # equal Froude number
             natural = float(stride_frequency(params["speed"], params["height"], kind == "jog"))
-            params["cadence"] = 120.0 * natural * float(rng.uniform(0.94, 1.06))
+            params.setdefault("cadence", 120.0 * natural * float(rng.uniform(0.94, 1.06)))
         clip = generate(kind, n / rate, rate, seed=int(rng.integers(2**31)), **params)
         clips.append({**clip, "name": f"{i:02d}_{kind}"})
     return clips

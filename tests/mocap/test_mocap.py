@@ -788,6 +788,23 @@ def test_joined(tmp_path, capsys):
             assert capsys.readouterr().out == ""  # said before anything is read
 
 
+def test_builtin_backwards():
+    """People who stand or step, the pelvis never forwards: the gait of the mix, last frame first; one kind, split."""
+    clips = data.builtin_clips(name="backwards")
+    library = gait.library(mix=gait.BACKWARDS)
+    for clip, made in zip(clips, library):
+        assert np.array_equal(clip.pos[::-1], made["pos"]) and np.array_equal(clip.ball[::-1], made["ball"])
+    standing = 0
+    for clip in clips:
+        assert clip.name.startswith("back_") and not np.abs(np.diff(clip.quat, axis=0)).max() > 0.5
+        speed = np.diff(clip.pos[:, 0, :2], axis=0) * clip.rate
+        ahead = (speed * np.stack([np.cos(y := heading(clip.quat[:-1, 0])), np.sin(y)], 1)).sum(1)
+        assert -1.1 < ahead.min() < -0.1 and ahead.max() < 0.05
+        standing += np.abs(ahead[:10]).max() < 0.05
+    assert standing > len(clips) / 2
+    assert {data.split_of(c.name) for c in clips} == {"train", "validation"}
+
+
 def test_licences(tmp_path):
     """The first line of a folder's licence; one without says so; what is built in needs none."""
     (tmp_path / "a").mkdir()
