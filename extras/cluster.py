@@ -344,8 +344,8 @@ class Trainer(ppo.Trainer):
 def connected(opt: Options):
     """A Ray cluster with a core for every thread, until the block ends: the one at --address, or one of this machine.
 
-    Raises    UserError: none is there, or it has fewer cores
-    Test      tests/extras/test_cluster.py::test_bad_commands"""
+    Raises    UserError: none is there, or its machines have no room for all workers
+    Test      tests/extras/test_cluster.py::test_bad_commands, test_too_few_cores, test_busy_cluster"""
     need = opt.workers * opt.threads
     for name in OURS:
         os.environ.setdefault(name, "0")
@@ -358,12 +358,18 @@ def connected(opt: Options):
         ray.init(**how, runtime_env={"env_vars": ONE_THREAD}, logging_level="error", log_to_driver=False)
     except (OSError, ValueError) as e:
         start = "ray start --head --port 6379"
-        raise UserError(f"--address {opt.address}: no Ray cluster there ({e}); this starts one: {start}") from None
+        where = f"--address {opt.address}: no Ray cluster there, or one with another token (RAY_AUTH_MODE=token)"
+        raise UserError(f"{where}: {e}; this starts one: {start}") from None
     try:
-        have = int(ray.cluster_resources().get("CPU", 0))
-        if have < need:
-            asked = f"--workers {opt.workers} × --threads {opt.threads}"
-            raise UserError(f"{asked}: {need} cores, and the cluster has {have}; valid: no more than that")
+        cores = [int(n["Resources"].get("CPU", 0)) for n in ray.nodes() if n["Alive"]]
+        room = sum(n // opt.threads for n in cores)  # a worker's threads are of one machine
+        if room < opt.workers:
+            asked = f"--workers {opt.workers} × --threads {opt.threads}: {need} cores"
+            has = f"the cluster has {sum(cores)}, room for {room} workers"
+            raise UserError(f"{asked}, and {has}; valid: no more than that")
+        free = int(ray.available_resources().get("CPU", 0))
+        if free < need:  # Ray itself would say nothing
+            print(f"note: {need} cores are needed and {free} are free; this run waits for the others", flush=True)
         yield
     finally:
         ray.shutdown()

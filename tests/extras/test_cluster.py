@@ -358,5 +358,18 @@ def test_killed_driver(nodes, whole, tmp_path):
 def test_too_few_cores(nodes, tmp_path):
     with pytest.raises(UserError, match="--workers 8 × --threads 1: 8 cores, and the cluster has"):
         on_ray(nodes, tmp_path / "a", 1, "--workers", "8")
+    with pytest.raises(UserError, match="--workers 1 × --threads 2: 2 cores, and the cluster has .*room for 0 workers"):
+        on_ray(nodes, tmp_path / "a", 1, "--workers", "1", "--threads", "2")  # a core each
     with pytest.raises(UserError, match="--address 127.0.0.1:1: no Ray cluster there.*ray start --head"):
         cluster.main([*TINY, "--workers", "2", "--address", "127.0.0.1:1", "--out", str(tmp_path / "b")])
+
+
+def test_busy_cluster(nodes, capsys):
+    """Cores that another run holds are waited for, and a line says so."""
+    opt = cluster.Options(address=nodes.address, workers=2)
+    for free in (1, 2):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(cluster.ray, "available_resources", lambda n=free: {"CPU": float(n)})
+            with cluster.connected(opt):
+                pass
+        assert ("2 cores are needed and 1 are free" in capsys.readouterr().out) == (free < 2)
