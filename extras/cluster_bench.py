@@ -53,7 +53,7 @@ class Options(cluster.Options):
     update_us: float = arg(72.8, "with --plan: the driver's time to learn from a step [µs]", check=POSITIVE)
     engine_us: float = arg(1.22, "with --plan: the driver's time to take a step in [µs]", check=POSITIVE)
     sample_bytes: float = arg(2304.0, "with --plan: of a step, on its way to the driver", check=POSITIVE)
-    weight_bytes: float = arg(2.42e6, "with --plan: of both networks", check=POSITIVE)
+    weight_bytes: float = arg(2424260.0, "with --plan: of both networks", check=POSITIVE)
     latency_ms: float = arg(0.7, "with --plan: of a question and its answer [ms]", check=POSITIVE)
     spread: float = arg(0.1, "with --plan: standard deviation of a rollout's time, as a share of it", check=POSITIVE)
     gigabits: float = arg(10.0, "with --plan: of the network, a second", check=POSITIVE)
