@@ -19,6 +19,7 @@ simulated twice, and the policy is the same to the bit.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import socket
 import time
@@ -49,6 +50,9 @@ SENT = ("x", "action", "mu", "logp", "reward", "old_value", "next_value", "termi
 MADE_OF = ("char", "ref", "horizon", "substeps", "asymmetric", "starts", "root_limit", "disturbance")  # an Env
 LINES = "workers.csv"  # of the run folder: a line a worker and update
 PATIENCE = 10.0  # s for a cluster's head to answer
+ROOT = Path(__file__).resolve().parent.parent
+MADE_BY = [*sorted(ROOT.glob("*.py")), ROOT / "extras/train.py", ROOT / "extras/cluster.py"]  # a rollout
+CODE = hashlib.sha256(b"".join(path.read_bytes() for path in MADE_BY)).hexdigest()  # what this machine has of it
 TRIES = 5  # a rollout whose worker is lost so often is given up
 OURS = ("RAY_USAGE_STATS_ENABLED", "RAY_worker_niceness")  # 0: nothing is sent out; workers as important as the driver
 ONE_THREAD = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")}  # of a worker's BLAS
@@ -101,7 +105,7 @@ class Worker:
         """Start all characters.  -> full (n, critic) their first observations; state"""
         env = self.trainer.env
         env.reset(seed)
-        return {"full": env.full.copy(), "state": env.state()}
+        return {"full": env.full.copy(), "state": env.state(), "code": CODE}
 
     def load(self, state):
         """Continue from a state.  ValueError: another environment's"""
@@ -112,7 +116,7 @@ class Worker:
 
         Args      weights : `Policy.arrays`; rng : of the exploration
         Returns   samples : SENT, each (T, n, …); stats : `ppo.Trainer.collect`'s; seen : count, mean and m2 of the raw
-                  observations, which are not sent; rng, state : to go on from; seconds : it took"""
+                  observations, which are not sent; rng, state : to go on from; seconds : it took; code : CODE"""
         trainer, began = self.trainer, time.perf_counter()
         if state:
             self.load(state)
@@ -124,7 +128,7 @@ class Worker:
         samples = {name: getattr(trainer, name) for name in SENT}
         ended = {"rng": trainer.rng, "state": trainer.env.state()}
         found = {"samples": samples, "stats": stats, "seen": seen.state()} | ended
-        return found | {"seconds": time.perf_counter() - began}
+        return found | {"seconds": time.perf_counter() - began, "code": CODE}
 
 
 # ------------------------------------------------------------------------------------ all of them
@@ -192,10 +196,14 @@ class Workers:
         """What every worker answers, in their order and not in that of time.  One that is lost begins again.
 
         Args      args : of each worker
-        Raises    UserError: a worker is lost time and again
-        Test      tests/extras/test_cluster.py::test_lost_worker_changes_nothing, test_lost_too_often"""
+        Raises    UserError: a worker is lost time and again; its machine has other code
+        Test      tests/extras/test_cluster.py::test_lost_worker_changes_nothing, test_lost_too_often, test_other_code"""
         asked = [self.ask(k, name, *each) for k, each in enumerate(args)]
-        return [self.persist(k, name, asked[k], args[k]) for k in range(self.workers)]
+        found = [self.persist(k, name, asked[k], args[k]) for k in range(self.workers)]
+        for k, answer in enumerate(found):
+            if answer and answer["code"] != CODE:
+                raise UserError(f"worker {k}: its machine has other code than this one; valid: the same commit on all")
+        return found
 
     def persist(self, k, name, asked, args):
         """Worker k's answer to what it was asked, through its losses."""

@@ -364,6 +364,15 @@ def test_too_few_cores(nodes, tmp_path):
         cluster.main([*TINY, "--workers", "2", "--address", "127.0.0.1:1", "--out", str(tmp_path / "b")])
 
 
+def test_other_code(tmp_path, monkeypatch):
+    """A machine with another commit is found out with its first answer, before anything is learnt from it."""
+    collect = Worker.collect
+    monkeypatch.setattr(Worker, "collect", lambda *args: collect(*args) | {"code": "another"})
+    with pytest.raises(UserError, match="worker 0: its machine has other code than this one; valid: the same commit"):
+        here(tmp_path / "a", 2, "--workers", "2")
+    assert not (tmp_path / "a" / CHECKPOINT).exists()
+
+
 def test_busy_cluster(nodes, capsys):
     """Cores that another run holds are waited for, and a line says so."""
     opt = cluster.Options(address=nodes.address, workers=2)
