@@ -197,7 +197,8 @@ class Workers:
 
         Args      args : of each worker
         Raises    UserError: a worker is lost time and again; its machine has other code
-        Test      tests/extras/test_cluster.py::test_lost_worker_changes_nothing, test_lost_too_often, test_other_code"""
+        Test      tests/extras/test_cluster.py::test_lost_worker_changes_nothing, test_lost_too_often,
+                  test_other_code"""
         asked = [self.ask(k, name, *each) for k, each in enumerate(args)]
         found = [self.persist(k, name, asked[k], args[k]) for k in range(self.workers)]
         for k, answer in enumerate(found):

@@ -15,18 +15,21 @@ from human import FEET, Clip, heading
 
 # ------------------------------------------------------------------------------------ a rest pose in front
 
-REST_FRAMES = 150  # at most so many
+REST_FRAMES = 600  # at most so many: 5 s at 120 Hz
 REST_JUMP = 0.1  # of the body's size, from the rest pose to the motion: 17 cm of an adult in one frame
 REST_RATIO = 2.5  # of the fastest that follows
 REST_ALIKE = 2e-3  # of the body's size: how far the frames of a rest pose differ
-REST_SEEN = 450  # frames that are compared
+REST_STILL = 1.5  # instead of 2.5, after two frames or more in which nothing moves at all: nobody stands so still
+STILL = 1e-5  # of the body's size: what files round by
+REST_SEEN = 1000  # frames that are compared
 
 
 def leading_rest(pos) -> int:
     r"""Frames at the beginning that are a rest pose and not motion.
 
     Rule      the frames are alike, and then some joint moves by more than a tenth of the body's size in one frame and
-              by 2.5 times as much as any joint does in the 99th percentile of what follows, and in the next five frames
+              by 2.5 times as much as any joint does in the 99th percentile of what follows, and the next five;
+              after frames that are the same to the digit, by 1.5 times: hanging arms where the walk begins
     ASSUMED   the numbers.  No rate is needed: a wrong one must not hide the jump
     Args      pos : (T, J, 3) joints, any unit
     Returns   0 to REST_FRAMES
@@ -39,11 +42,15 @@ def leading_rest(pos) -> int:
     if not size > 0:
         return 0
     step = np.linalg.norm(np.diff(pos, axis=0), axis=-1).max(axis=1) / size
+    still = True
     for k in range(min(REST_FRAMES, len(step) - 6)):
         if k and step[k - 1] > REST_ALIKE:
             break
+        still = still and (k == 0 or step[k - 1] < STILL)
+        if step[k] <= REST_JUMP:
+            continue
         after = max(np.percentile(step[k + 1 :], 99), step[k + 1 : k + 6].max())
-        if step[k] > max(REST_JUMP, REST_RATIO * after):
+        if step[k] > (REST_STILL if k and still else REST_RATIO) * after:
             return k + 1
     return 0
 
@@ -58,7 +65,7 @@ def may_rest(values) -> bool:
         return False
     first = step[:-5]
     after = np.max([step[i : i + len(first)] for i in range(1, 6)], axis=0)
-    return bool((first > REST_RATIO * after + 1e-9).any())
+    return bool((first > REST_STILL * after + 1e-9).any())
 
 
 # ------------------------------------------------------------------------------------ a floor that is elsewhere

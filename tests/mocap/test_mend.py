@@ -13,7 +13,7 @@ from test_amc import standing as amc_standing
 from test_mocap import rot, walk, write_as
 from test_rigs import degrees_off, joints_of, turned_alike, upright, write_rig
 
-from human import Clip, resample
+from human import FEET, Clip, resample
 from mocap import bvh, data, guess, inspect, mend, rigs
 from mocap.rigs import Reading
 from plumbing.cli import UserError
@@ -215,6 +215,19 @@ def test_leading_rest(tmp_path, capsys, frames, away, rate):
     assert "dropped" not in capsys.readouterr().err
     raw = bvh.read(tmp_path / "a.bvh").values
     assert mend.may_rest(raw) and not mend.may_rest(raw[:5])
+
+
+@pytest.mark.parametrize("frames", (2, 30, 400))
+def test_rest_where_it_begins(frames):
+    """Arms that hang, where the walk begins: small a jump, but nobody is still to the digit before it."""
+    pos = walk(3.0, rate=30.0).pos
+    apart = np.linalg.norm(pos[:, FEET[0], :2] - pos[:, FEET[1], :2], axis=-1)
+    pos = pos[int(apart.argmax()) :]
+    pose = upright(frames).pos
+    pose = pose + [*(pos[0, 0, :2] - pose[0, 0, :2]), 0.0]
+    assert mend.leading_rest(np.concatenate([pose, pos])) == frames
+    moved = pose + 1e-3 * np.random.default_rng(0).normal(size=pose.shape)  # somebody who stands there
+    assert mend.leading_rest(np.concatenate([moved, pos])) == 0
 
 
 def test_no_rest_pose(mocap_dir):
