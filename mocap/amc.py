@@ -217,6 +217,7 @@ def _parse_units(path, rows):
             _fail(path, f"{key} of :units is {values[key]:g}; expected {valid}", line)
     line, words = found.get("angle", (rows[0][0], []))
     angle = " ".join(words).lower()
+    angle = {"degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad"}.get(angle, angle)
     if angle not in ("deg", "rad"):
         _fail(path, f"angle of :units is {_show(angle)}; expected deg or rad", line)
     return values["mass"], values["length"], angle == "deg"

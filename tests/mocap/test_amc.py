@@ -207,6 +207,7 @@ def test_spellings(tmp_path):
         "bom, tabs": "\ufeff" + SMALL.replace("     ", "\t").replace("\n", "  # note\n\n"),
         "capitals": SMALL.replace("dof rx rz", "DOF RX RZ").replace("XYZ", "xyz").replace(":root", ":ROOT"),
         "other order": tree + bones + body,
+        "spelt": SMALL.replace("angle deg", "angle Degrees"),
         "limits on one line": SMALL.replace("20.0)\n", "20.0)"),
     }
     for what, text in texts.items():
@@ -258,7 +259,7 @@ MALFORMED_ASF = {  # name: (text, what the message must say)
     "truncated in the hierarchy": (SMALL[: SMALL.rindex("  end")], ":hierarchy has no end"),
     "empty hierarchy": (asf_swap(BODY[BODY.index("  begin\n    root") :], ""), ":hierarchy has no end"),
     "empty bonedata": (HEADER + ":bonedata\n" + BODY[BODY.index(":hierarchy") :], ":bonedata holds no bone"),
-    "angle": (asf_swap("angle deg", "angle degrees"), "line 7: angle of :units is 'degrees'; expected deg or rad"),
+    "angle": (asf_swap("angle deg", "angle turns"), "line 7: angle of :units is 'turns'; expected deg or rad"),
     "no angle": (asf_swap("  angle deg\n", ""), "angle of :units is ''"),
     "length zero": (asf_swap("length 0.45", "length 0"), "line 6: length of :units is 0; expected a positive"),
     "length of words": (asf_swap("length 0.45", "length inches"), "length of :units is 'inches'; expected one number"),
