@@ -49,7 +49,10 @@ _HELD = ("hand", "controller", "touch", "wand", "index", "anchor", "device", "tr
 _POSITION = ("p", "pos", "position", "loc", "location", "translation")
 _ROTATION = ("q", "quat", "quaternion", "rot", "rotation", "ori", "orient", "orientation")
 _MATRIX = ("m", "mat", "matrix", "pose", "transform")
-_LOOSE = ("l", "r", "t", "local", "world", "global", "knuckles", "oculus", "quest", "vive", "camera")
+_LOOSE = (
+    *("l", "r", "t", "local", "world", "global", "knuckles", "oculus", "quest", "vive", "camera", "user", "player"),
+    *("vr", "ovr", "wrist", "node"),
+)
 _WORD, _LOOSE_WORD = (
     "|".join(sorted((*_HEAD, *_SIDES, *_HELD, *_POSITION, *_ROTATION, *"xyzw", *more), key=len, reverse=True))
     for more in ((), _LOOSE)

@@ -37,6 +37,10 @@ LOOSE = {  # forms that are read only where a file lacks columns otherwise: head
     "makers": ("vive headset", "left vive wand", "pos", "rot"),
     "prefix": ("player1.Head", "player1.LeftTouch", "Pos", "Orientation"),
     "metres": ("head", "left", "pos", "rot"),
+    "wrists": ("Head", "LeftWrist", "Pos", "Rot"),
+    "nodes": ("headNode", "leftNode", "position", "rotation"),
+    "players": ("userHead", "userLeftHand", "pos", "rot"),
+    "virtual": ("OVRHead", "VRLeft", "pos", "quat"),
 }
 
 
@@ -51,8 +55,8 @@ def test_what_all_columns_share(form):
     names = [f"{devices[c.split('_')[0]]} {position if '_p' in c else rotation}{c[-1]}" for c in want]
     names = [n + unit * ("_p" in c) for n, c in zip(names, want)]
     assert columns(["unix time (ms)", *names, "frame"], COLUMNS[1:]) == ["time", *want, None]
-    both = [*COLUMNS[1:], "l_pos_x", "local_head_pos_x", "camera_x"]
-    assert columns(both, COLUMNS[1:]) == [*COLUMNS[1:], None, None, None]
+    both = [*COLUMNS[1:], "l_pos_x", "local_head_pos_x", "camera_x", "left_wrist_px"]
+    assert columns(both, COLUMNS[1:]) == [*COLUMNS[1:], None, None, None, None]
 
 
 @pytest.mark.parametrize("name", [
