@@ -217,7 +217,7 @@ TRAINING = {  # [training], a recipe: flags of ppo.py and of extras/train.py, wh
     "target_kl?": positive, "sigma?": positive, "min_sigma?": positive,
     "root_limit?": positive, "root_lag?": at_least_0,
     "balance?": switch, "augment?": switch, "visits?": switch,
-    "retry?": share, "stand?": share, "begin?": share, "kinds?": share,
+    "retry?": share, "stand?": share, "begin?": share, "kinds?": share, "aid?": share,
     "sensor_noise?": at_least_0, "sensor_offset?": at_least_0, "push?": at_least_0,
     "by?": extra,
 }  # fmt: skip

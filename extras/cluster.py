@@ -89,7 +89,7 @@ def env_of(parts: dict, n: int, threads: int) -> Env:
     for name, value in starts.state().items():
         setattr(starts, name, value)  # `state` returned a copy
     if disturbance:
-        disturbance.error = np.zeros((n, *disturbance.error.shape[1:]))
+        disturbance.error, disturbance.pull = np.zeros((n, *disturbance.error.shape[1:])), np.zeros(n)
     return Env(n=n, threads=threads, **parts)
 
 

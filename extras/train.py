@@ -31,6 +31,7 @@ import retarget
 from env import EPISODE_STEPS, ROOT_LIMIT, WITHOUT, Env, Uniform, ablated, headset_only
 from extras import gpu
 from headset import body
+from human import quat_conj, quat_mul
 from mocap import augment, data
 from mocap.rigs import Reading
 from plumbing.cli import NONNEGATIVE, POSITIVE, UNIT, UserError, arg, run_main
@@ -47,6 +48,8 @@ SHORTEST = 1.0  # s of a clip that is made a visit
 RUNS = 2.0  # m/s, ASSUMED: a stitched sequence with a faster second is made visits, too
 FEW, MORE = 100, 2  # ASSUMED: visits of parts of --motion that have fewer clips are made by so many more other users
 PLAYERS_STAND = 1.5  # ASSUMED: s at a recording's beginning in which a player stands well enough to start under
+AIDED = 10.0  # s between failures, ASSUMED: sequences that do as well are not aided
+REACHED = 0.5  # s, ASSUMED: in which the hand that aids would have the root at its target
 PUSH_SECONDS = 2.0  # mean time between pushes
 CODE = 4  # counts up when retargeting or augmenting changes what it makes: older caches are then made anew
 CHUNK = 100  # clips retargeted between two lines of progress
@@ -71,6 +74,7 @@ class Options(ppo.Options):
     sensor_offset: float = arg(0.0, "constant error of device positions in an episode [m]", check=NONNEGATIVE)
     sensor_noise: float = arg(0.0, "white noise on device positions [m]", check=NONNEGATIVE)
     push: float = arg(0.0, "largest random push, every 2 s on average [m/s]", check=NONNEGATIVE)
+    aid: float = arg(0.0, "a hand on the root where a sequence fails often: at most so much of it a step", check=UNIT)
     root_limit: float = arg(ROOT_LIMIT, "an episode ends as far from the root's target [§3.6: 0.30 m]", check=POSITIVE)
     root_lag: float = arg(0.0, "and as far again as the user went in so many seconds, of late", check=NONNEGATIVE)
     episode: int = arg(EPISODE_STEPS, "control steps to truncation [§3.6]", check=POSITIVE)
@@ -200,28 +204,44 @@ def by_kind(p, failing, size, kind, share):
 
 
 class Disturbance:
-    """What training adds so that a policy survives other users and devices.
+    r"""What training adds: so that a policy survives other users and devices, or, `aid`, so that it learns at all.
 
     sensor_offset : standard deviation of a constant error of each device's position in an episode [m]
     sensor_noise  : of white noise on it [m]
     push          : largest change of the root's horizontal velocity in a push [m/s]
+    aid           : largest α of a hand that leads the root to its target
     error         : (n, 3, 3 devices) of the devices' positions, in the heading frame: constant, of the frame before, of
                     this frame
-    Test     tests/extras/test_train.py::test_disturbance
+    pull          : (n,) α of the present episodes
+    Equation  before a control step  v ← v + α (v̂ + (p̂ − p) / REACHED − v),  ω ← ω + α (ω̂ + φ / REACHED − ω);
+              α = aid u max(0, 1 − T / AIDED),  u uniform in [0, 1] for each episode
+    Symbols   p, v, ω the root's, hats its target's of the next frame; φ the turn from one to the other, 2 Im(q⁻¹ q̂);
+              T seconds between the failures of the episode's sequence, of late
+    Why       noise does not find the first step backwards: a character that stands is safe until it is too far.  Led
+              by the hand it steps, by the reward for its legs, and the hand lets go as it fails less
+    Source    the idea of an assistant that withdraws: Yu, Turk, Liu 2018, "Learning Symmetric and Low-Energy Locomotion",
+              ACM TOG 37(4)
+    Test      tests/extras/test_train.py::test_disturbance, test_aid
     """
 
-    def __init__(self, n, devices=3, sensor_offset=0.0, sensor_noise=0.0, push=0.0):
-        self.sensor_offset, self.sensor_noise, self.push = sensor_offset, sensor_noise, push
-        self.error = np.zeros((n, 3, 3 * devices))
+    def __init__(self, n, devices=3, sensor_offset=0.0, sensor_noise=0.0, push=0.0, aid=0.0):
+        self.sensor_offset, self.sensor_noise, self.push, self.aid = sensor_offset, sensor_noise, push, aid
+        self.error, self.pull = np.zeros((n, 3, 3 * devices)), np.zeros(n)
 
     def begin(self, env, ids):
-        """Other devices for the episodes that begin in the environments ids."""
+        """Other devices, and another hand, for the episodes that begin in the environments ids."""
         if self.sensor_offset:
             self.error[ids, 0] = self.sensor_offset * env.rng.standard_normal(self.error[ids, 0].shape)
+        if self.aid:
+            k, starts = env.sequence[ids], env.starts
+            apart = env.dt * starts.lived[k] / np.maximum(starts.failed[k], 1e-6)  # T
+            self.pull[ids] = self.aid * np.maximum(1.0 - apart / AIDED, 0.0) * env.rng.random(len(ids))
 
     def step(self, env):
-        """Before a control step: pushes, and the next frame's sensor noise."""
+        """Before a control step: the hand that aids, pushes, and the next frame's sensor noise."""
         rng = env.rng
+        if self.aid:
+            self._lead(env)
         if self.push:
             pushed = np.flatnonzero(rng.random(env.n) < env.dt / PUSH_SECONDS)
             angle, size = rng.uniform(0, 2 * np.pi, len(pushed)), rng.uniform(0, self.push, len(pushed))
@@ -231,6 +251,17 @@ class Disturbance:
             self.error[:, 1] = self.error[:, 2]
             self.error[:, 2] = self.sensor_noise * rng.standard_normal(self.error[:, 2].shape)
 
+    def _lead(self, env):
+        """The root's velocities (MuJoCo's: v in the world, ω in the root's frame) towards those that reach the target.
+
+        Test      tests/extras/test_train.py::test_aid"""
+        led, ref = np.flatnonzero(self.pull), env.ref
+        f = np.minimum(env.frame[led] + 1, ref.last[env.sequence[led]])
+        turn = quat_mul(quat_conj(env.qpos[led, 3:7]), ref.qpos[f, 3:7])
+        phi = 2.0 * np.sign(turn[:, :1]) * turn[:, 1:]
+        way = np.concatenate([ref.qpos[f, :3] - env.qpos[led, :3], phi], axis=1) / REACHED
+        env.qvel[led, :6] += self.pull[led, None] * (ref.qvel[f, :6] + way - env.qvel[led, :6])
+
     def errors(self, ids):
         """What the environments ids see wrong, of the frame before and of this one: two of (m, 3 devices) [m]"""
         constant, before, now = np.moveaxis(self.error[ids], 1, 0)
@@ -238,11 +269,11 @@ class Disturbance:
 
     def state(self):
         """Arrays that a resumed run needs."""
-        return {"error": self.error.copy()}
+        return {"error": self.error.copy(), "pull": self.pull.copy()}
 
     def load_state(self, arrays):
         """Continue from what `state` returned."""
-        self.error[:] = arrays["error"]
+        self.error[:], self.pull[:] = arrays["error"], arrays["pull"]
 
 
 # ------------------------------------------------------------------------------------ motions, read once
@@ -443,8 +474,9 @@ def make_env(opt: Options) -> Env:
     char = ablated(whole, opt.without, opt.track).solved_by(opt.solver)
     ref = reference_of(opt, char)
     ref = headset_only(ref) if opt.sensors == "hmd" else ref
-    added = {name: getattr(opt, name) for name in ("sensor_offset", "sensor_noise", "push")}
+    added = {name: getattr(opt, name) for name in ("sensor_offset", "sensor_noise", "push", "aid")}
     starts = {name: getattr(opt, name) for name in ("balance", "retry", "stand", "begin", "kinds")}
+    counted = any(starts.values()) or opt.aid  # failures by sequence
     return Env(
         char,
         ref,
@@ -454,7 +486,7 @@ def make_env(opt: Options) -> Env:
         opt.episode,
         disturbance=Disturbance(opt.envs, ref.sensor_pos.shape[1], **added) if any(added.values()) else None,
         asymmetric="asymmetric" not in opt.without,
-        starts=Curriculum(ref, opt.episode, **starts, kind=kind_of(ref.names, opt)) if any(starts.values()) else None,
+        starts=Curriculum(ref, opt.episode, **starts, kind=kind_of(ref.names, opt)) if counted else None,
         root_limit=patience(ref, opt.root_limit, opt.root_lag) if opt.root_lag else opt.root_limit,
     )
 

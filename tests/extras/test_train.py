@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from test_env import rollout
 from test_ppo import TINY, assert_same_run
 
@@ -451,10 +452,39 @@ def test_switches_reach_the_environment(tmp_path):
     assert motions(other.ref) != motions(train.make_env(replace(opt, augment=True, seed=1)).ref)
 
 
+def test_aid(char, ref):
+    """The hand against SciPy's rotations, one character at a time; less of it the less a sequence fails, none from
+    AIDED on."""
+    n = 64
+    env = Env(char, ref, n, starts=Curriculum(ref, balance=True), disturbance=Disturbance(n, aid=0.8))
+    env.starts.failed[:], env.starts.lived[:] = 1.0, 2.0 / env.dt  # fails every 2 s
+    env.reset(frames=np.resize(np.arange(5, 55), n))
+    pull = env.disturbance.pull.copy()
+    assert 0.0 <= pull.min() < 0.1 and 0.5 < pull.max() <= 0.8 * (1.0 - 2.0 / train.AIDED)
+    rng = np.random.default_rng(1)
+    env.qpos[:, :7] += 0.1 * rng.standard_normal((n, 7))
+    env.qpos[:, 3:7] *= rng.choice([-1.0, 1.0], (n, 1)) / np.linalg.norm(env.qpos[:, 3:7], axis=1, keepdims=True)
+    env.qvel[:] += rng.standard_normal(env.qvel.shape)
+    before = env.qvel.copy()
+    env.disturbance.step(env)
+    np.testing.assert_array_equal(env.qvel[:, 6:], before[:, 6:])
+    for i in range(n):
+        f = env.frame[i] + 1
+        own, target = (Rotation.from_quat(q, scalar_first=True) for q in (env.qpos[i, 3:7], ref.qpos[f, 3:7]))
+        turn = (own.inv() * target).as_rotvec()
+        small = np.linalg.norm(turn) / 2
+        wanted = ref.qvel[f, :6] + np.concatenate(
+            [ref.qpos[f, :3] - env.qpos[i, :3], turn * np.sin(small) / small]) / train.REACHED  # fmt: skip
+        np.testing.assert_allclose(env.qvel[i, :6], (1 - pull[i]) * before[i, :6] + pull[i] * wanted, atol=1e-6)
+    env.starts.lived[:] = train.AIDED / env.dt
+    env.reset()
+    assert not env.disturbance.pull.any()
+
+
 def test_resume_is_exact_when_disturbed(tmp_path):
     """The same with everything on that draws random numbers: other users, device errors, pushes."""
     more = "--augment --balance --retry 0.3 --stand 0.3 --begin 0.3 --sensor-offset 0.02 --sensor-noise 0.005".split()
-    more += ["--push", "5", "--kinds", "0.3"]
+    more += ["--push", "5", "--kinds", "0.3", "--aid", "0.5"]
     run(tmp_path / "whole", 4, *more)
     run(tmp_path / "a", 2, *more)
     run(tmp_path / "a", 4, "--resume")
