@@ -219,8 +219,8 @@ class Disturbance:
               T seconds between the failures of the episode's sequence, of late
     Why       noise does not find the first step backwards: a character that stands is safe until it is too far.  Led
               by the hand it steps, by the reward for its legs, and the hand lets go as it fails less
-    Source    the idea of an assistant that withdraws: Yu, Turk, Liu 2018, "Learning Symmetric and Low-Energy Locomotion",
-              ACM TOG 37(4)
+    Source    the idea of an assistant that withdraws: Yu, Turk, Liu 2018, "Learning Symmetric and Low-Energy
+              Locomotion", ACM TOG 37(4)
     Test      tests/extras/test_train.py::test_disturbance, test_aid
     """
 
