@@ -1,7 +1,9 @@
-r"""A teacher that sees the pose, and a student that copies it: arms follow before they are rewarded for it  (ours).
+r"""Teachers that are copied: one that sees the pose, so that arms follow before they are rewarded for it, and experts
+of single motions, so that one policy does what several learnt  (ours).
 
     python -m extras.teacher --character jesse --motion FOLDER --init characters/jesse.npz --steps 1500000 --out runs/t
     python ppo.py --character jesse --motion FOLDER --init runs/t --out runs/a               then PPO goes on from it
+    python -m extras.teacher --character jesse --motion FOLDER --init characters/jesse.npz --expert 'back_*=runs/b' …
 
 Eq. 8's kernel is flat where an arm is far from the user's: with Table 2's k a hanging arm that should be raised earns
 e^-10 of its reward, and a little higher earns no more.  So PPO leaves it hanging, and elbows alone bend.  What an arm
@@ -11,6 +13,10 @@ leads there.
     state ──► student's noisy action ──► next state                          the student drives [Ross11]
       ├─────► teacher: PD torque of the arms, the old policy's action elsewhere ──┐
       └─────► student's mean action ──────────────────────────────────────────────┴─► squared error, Adam
+
+An expert is a policy that learnt a few kinds of motion alone, steps backwards for example, and forgot the others
+meanwhile.  In sequences that are its own the student copies it, arms too, and in all others the old policy.  An average
+of their weights can do neither.
 
 The student sees sensors alone, as ever.  Its normaliser stays as it was; its critic learns what the new actions are
 worth.
@@ -23,6 +29,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from statistics import fmean
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as ppo.py does, and says why; before NumPy is loaded
@@ -37,7 +44,7 @@ from extras import train
 from nn import clip_grad_norm
 from plumbing.cli import POSITIVE, UserError, arg, run_main
 from plumbing.training import progress_line, read_options
-from policy import load_policy, widths
+from policy import check_fits, load_policy, widths
 
 RATE, DAMPING = 6.0, 0.7  # rad/s and of critical damping, ASSUMED: of the teacher's arms, spring included
 FARTHEST, FASTEST = 0.5, 6.0  # rad, rad/s, ASSUMED: an arm farther off is pulled no harder, none is asked for more
@@ -50,6 +57,9 @@ class Options(train.Options):
     BY = "extras.teacher"
 
     joints: tuple[str, ...] = arg(("shoulder", "elbow"), "groups of driven joints that are taught", metavar="NAME,…")
+    expert: tuple[str, ...] = arg(
+        (), "instead of the arms: whom to copy in which sequences, by shell patterns", metavar="PATTERN=POLICY,…"
+    )
     teacher_lr: float = arg(3e-4, "learning rate of the student's copying", check=POSITIVE)
 
 
@@ -107,22 +117,48 @@ class Teacher:
         return np.clip(torque / self.limits, -1.0, 1.0)
 
 
-class Student(ppo.Trainer):
-    """Collects as PPO does, and copies: the teacher's arms, and what it was itself elsewhere.
+def experts(asked, env: Env) -> tuple[list, np.ndarray]:
+    """The policies of --expert, and whose each sequence is: the first whose pattern fits its name, or -1.
 
-    Test     tests/extras/test_teacher.py::test_student_copies, test_resume_is_exact"""
+    Raises    UserError: not PATTERN=POLICY, no sequence of that name, or a policy of another body
+    Test      tests/extras/test_teacher.py::test_experts"""
+    policies, whose = [], np.full(len(env.ref.names), -1)
+    for k, one in enumerate(asked):
+        pattern, _, path = one.partition("=")
+        fits = np.array([fnmatchcase(name, pattern) for name in env.ref.names])
+        if not (path and fits.any()):
+            names = ", ".join(env.ref.names[:6])
+            raise UserError(f"--expert {one}: valid: PATTERN=POLICY, the pattern of sequences such as {names}")
+        policy, _ = load_policy(path)
+        check_fits(policy, env, path)
+        policies.append(policy)
+        whose[fits & (whose < 0)] = k
+    return policies, whose
+
+
+class Student(ppo.Trainer):
+    """Collects as PPO does, and copies: the teacher's arms or the experts, and what it was itself elsewhere.
+
+    wanted, by_teacher : (horizon, N, u) the actions to copy, and which of them are a teacher's or an expert's
+    Test     tests/extras/test_teacher.py::test_student_copies, test_student_of_an_expert, test_resume_is_exact"""
 
     def __init__(self, opt: Options, env: Env, policy=None):
         super().__init__(opt, env, policy)
         self.old, _ = load_policy(opt.init)
-        self.arms, self.teacher = taught(env.char, opt.joints), Teacher(env)
-        self.wanted = np.zeros_like(self.mu)
+        self.experts, self.whose = experts(opt.expert, env)
+        self.arms, self.teacher = taught(env.char, () if opt.expert else opt.joints), Teacher(env)
+        self.wanted, self.by_teacher = np.zeros_like(self.mu), np.zeros(self.mu.shape, bool)
         self.adam_pi.lr = opt.teacher_lr
 
     def step(self, t):
         """As PPO's, and what the student should have done."""
-        self.wanted[t] = self.old.mean_action(self.env.full[:, : self.env.obs_size])
-        self.wanted[t][:, self.arms] = self.teacher()[:, self.arms]
+        seen, wanted, by_teacher = self.env.full[:, : self.env.obs_size], self.wanted[t], self.by_teacher[t]
+        wanted[:], by_teacher[:] = self.old.mean_action(seen), False
+        if len(self.arms):
+            wanted[:, self.arms], by_teacher[:, self.arms] = self.teacher()[:, self.arms], True
+        for k, expert in enumerate(self.experts):
+            rows = self.whose[self.env.sequence] == k
+            wanted[rows], by_teacher[rows] = expert.mean_action(seen[rows]), True
         super().step(t)
 
     def update(self) -> dict:
@@ -137,9 +173,10 @@ class Student(ppo.Trainer):
             losses = [self.copy(batch.x[rows], wanted[rows]) for rows in parts]
             epochs.append({"policy_loss": fmean(losses), "value_loss": self.fit_critic(batch, parts)})
         found = {k: fmean(e[k] for e in epochs) for k in epochs[0]}
-        error = batch.mu - wanted
-        found["taught_rms"] = float(np.sqrt(np.mean(error[:, self.arms] ** 2)))
-        found["kept_rms"] = float(np.sqrt(np.mean(np.delete(error, self.arms, axis=1) ** 2)))
+        error, by_teacher = np.square(batch.mu - wanted), self.by_teacher.reshape(wanted.shape)
+        found["taught_rms"], found["kept_rms"] = (
+            float(np.sqrt(error[part].mean())) if part.any() else 0.0 for part in (by_teacher, ~by_teacher)
+        )
         return self.told(found | {"kl": 0.0, "clip_fraction": 0.0}, batch.explained)
 
     def copy(self, x, wanted) -> float:

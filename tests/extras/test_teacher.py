@@ -120,6 +120,47 @@ def test_student_copies(start, tmp_path):
     train.main([*TINY, "--init", str(tmp_path / "a"), "--out", str(tmp_path / "b"), "--steps", "64"])
 
 
+def test_experts(start, tmp_path):
+    """Each sequence is the first expert's whose pattern fits its name, or nobody's; what fits nothing is refused."""
+    opt = teacher.Options(init=str(start), clips="*", envs=4, horizon=4, threads=1)
+    env = ppo.make_env(opt)
+    names = [n for n in env.ref.names]
+    first = names[0]
+    policies, whose = teacher.experts((f"{first}={start}", f"*={start}"), env)
+    assert len(policies) == 2 and whose.tolist() == [0 if n == first else 1 for n in names] and len(set(names)) > 1
+    assert (teacher.experts((f"{first}={start}",), env)[1] < 0).sum() == len(names) - 1
+    assert teacher.experts((), env)[0] == []
+    for bad in ("*walk*", "=x", f"nobody*={start}"):
+        with pytest.raises(UserError, match="valid: PATTERN=POLICY"):
+            teacher.experts((bad,), env)
+    with pytest.raises(UserError, match="Oppy|oppy|observations"):
+        teacher.experts((f"*={Path(ppo.__file__).parent / 'characters' / 'oppy.npz'}",), env)
+
+
+def test_student_of_an_expert(start, tmp_path):
+    """It is told the expert's action in the expert's sequences and its own old one elsewhere, one character at a time;
+    and comes nearer to the expert's."""
+    train.main([*TINY, "--out", str(tmp_path / "expert"), "--steps", "64", "--seed", "5"])
+    opt = teacher.Options(init=str(start), clips="*", envs=16, horizon=4, threads=1, expert=("x",))
+    name = ppo.make_env(opt).ref.names[0]
+    opt = replace(opt, expert=(f"{name}={tmp_path / 'expert'}",))
+    student = teacher.Student(opt, ppo.make_env(opt), load_policy(start)[0])
+    student.env.reset(seed=1)
+    old, expert = (load_policy(path)[0] for path in (start, tmp_path / "expert"))
+    seen, own = student.env.full[:, : student.env.obs_size].copy(), student.env.sequence == 0
+    student.collect()
+    assert 0 < own.sum() < 16
+    for i in range(16):
+        told = (expert if own[i] else old).mean_action(seen[i : i + 1])[0]
+        np.testing.assert_allclose(student.wanted[0, i], told, atol=1e-6)
+        assert student.by_teacher[0, i].all() if own[i] else not student.by_teacher[0, i].any()
+    more = "--epochs", "4", "--teacher-lr", "0.003", "--expert", f"{name}={tmp_path / 'expert'}"
+    run(tmp_path / "a", 30, "--init", str(start), "--clips", "*", *more)
+    rows = [row.split(",") for row in (tmp_path / "a" / "metrics.csv").read_text().splitlines()]
+    taught = np.array([float(r[rows[0].index("taught_rms")]) for r in rows[1:]])
+    assert taught[-10:].mean() < 0.8 * taught[:3].mean()
+
+
 def test_resume_is_exact(start, tmp_path):
     """Two updates, then two more, are four."""
     run(tmp_path / "whole", 4, "--init", str(start))
