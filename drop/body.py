@@ -333,6 +333,100 @@ def project_range_of_motion(x, twist, solved=None, low=LOW, high=HIGH):
     return out @ align(out[None], centred[None])[0].T + x.mean(axis=0)
 
 
+NEARER = 2  # ASSUMED: steps from clipped angles to the nearest pose inside the limits
+_DEPTHS = [np.array(g) for g in ([1, 2, 3], [4, 5, 6], [7, 8, 9], [12, 13, 14], [16, 17], [18, 19])]  # parents first
+_SWUNG = np.append(np.repeat(LIMITED, 2), 9)  # the joint of each free angle: two swings each, and spine3's twist
+_AXES = np.append(np.tile([0, 1], len(LIMITED)), 2)
+_BELOW = PATH[:, np.maximum(_SWUNG - 1, 0)].T * (np.arange(N) != _SWUNG[:, None])  # (33, 22): who turns with it
+
+
+def nearest_in_range(x, twist, solved=None):
+    r"""The nearest pose inside the joints' limits, for a limp body.
+
+    Equation  [DROP Eqs. 3, 7] x_r = argmin over p in C of ‖x − p‖², C = rigid motions of the poses whose swings and
+              twists are inside LIMITS.  The clipped angles of `project_range_of_motion` are in C, but not nearest; from
+              them `NEARER` steps of Gauss and Newton go on, with the angles in their box
+    Why       only with the nearest p is w (p − x) the force of an energy (envelope theorem).  Clipped angles turn a
+              whole leg for a fault of its hip; that force does work round a closed path, and where no prior holds the
+              body it drove one for nine seconds (REPRODUCE.md, "Lying still").  No net force and no torque, either
+    ASSUMED   `NEARER`; a twist is what the body had last, clipped: positions say nothing of it (but of spine3's).  A
+              carried body keeps clipped angles, which pull harder: with the nearest pose two who meet overlap by 17 cm
+              instead of 15, and a held heel topples a walker who stood
+    Args      x : (22, 3); twist : what `twists` returns; solved : swing_twist(x, twist), if it is known already
+    Returns   (22, 3): x itself if the pose is inside
+    Test      tests/drop/test_drop.py::test_a_limp_range_of_motion_is_an_energy, ::test_nearest_in_range
+    """
+    held = np.minimum(np.maximum(twist[0], LOW[:, 2]), HIGH[:, 2])
+    held[9] = twist[0][9]  # not used: spine3's bones say what its twist is
+    if not np.array_equal(held, twist[0]):
+        twist, solved = (held, twist[1]), None
+    R, _ = solved = solved or swing_twist(x, twist)
+    local = joint_angles(x, twist, solved)
+    angles = np.minimum(np.maximum(local, LOW), HIGH)
+    if np.abs(angles - local)[LIMITED].max() < 1e-9:
+        return x
+    centred = x - x.mean(axis=0)
+    p, turned = _posed(angles, R, centred)
+    for _ in range(NEARER):
+        step = _nearer(angles, p, turned, centred - p)
+        for share in (1.0, 0.3):
+            tried = angles.copy()
+            tried[_SWUNG, _AXES] += share * step
+            tried = np.minimum(np.maximum(tried, LOW), HIGH)
+            q, moved = _posed(tried, turned, centred)
+            if np.sum((centred - q) ** 2) < np.sum((centred - p) ** 2):
+                break
+        else:
+            break
+        angles, p, turned = tried, q, moved
+    return p + x.mean(axis=0)
+
+
+def _posed(angles, R, centred):
+    """Forward kinematics of joint angles (22, 3), laid on centred positions (22, 3) as a rigid body.
+
+    Args      R : (22, 3, 3) global rotations, of which the root's and the leaves' are used
+    Returns   positions (22, 3) centred; global rotations (22, 3, 3)
+    Test      as `nearest_in_range`"""
+    R = R.copy()
+    turn = _turn(np.matmul(angles[:, None, :2], BASIS)[:, 0]) @ _turn(angles[:, 2, None] * AXIS)
+    for level in _DEPTHS:
+        R[level] = R[PARENTS[level]] @ turn[level]
+    out = PATH @ np.matmul(R[PARENTS[1:]], OFFSETS[1:, :, None])[:, :, 0]
+    out -= out.mean(axis=0)
+    whole = align(out[None], centred[None])[0]
+    return out @ whole.T, whole @ R
+
+
+def _nearer(angles, p, R, left):
+    r"""A step of Gauss and Newton of the free angles, the whole body turning with them as it likes.
+
+    Equation  min over δ, ω of ‖left − J δ − ω × p‖²: ∂p_i/∂angle = a × (p_i − p_j) for i below joint j.  Of a swing v
+              a = R_parent J_l(v) e, J_l the left Jacobian of the rotation exp [v]×; of the twist a = R_j axis.  An
+              angle at its limit whose gradient points out of the box stays there
+    Args      angles (22, 3); p, left (22, 3) centred; R (22, 3, 3)
+    Returns   (33,) [rad] of `_SWUNG`, `_AXES`
+    Test      as `nearest_in_range`
+    """
+    v = np.matmul(angles[:, None, :2], BASIS)[:, 0]
+    theta = np.maximum(np.sqrt(np.einsum("ij,ij->i", v, v)), 1e-6)[:, None, None]
+    K = (v @ SKEW).reshape(-1, 3, 3)
+    left_jacobian = EYE3 + (1.0 - np.cos(theta)) / theta**2 * K + (theta - np.sin(theta)) / theta**3 * (K @ K)
+    about = np.concatenate([np.swapaxes(BASIS, 1, 2), np.zeros((N, 3, 1))], axis=2)
+    about = R[PARENTS] @ left_jacobian @ about
+    axis = about[_SWUNG, :, _AXES]
+    axis[-1] = R[9] @ AXIS[9]
+    columns = np.matmul((p - p[_SWUNG, None]) * _BELOW[:, :, None], (axis @ SKEW).reshape(-1, 3, 3).swapaxes(1, 2))
+    columns -= columns.mean(axis=1, keepdims=True)
+    A = np.concatenate([columns, np.matmul(p, SKEW.reshape(3, 3, 3).swapaxes(1, 2))]).reshape(len(_SWUNG) + 3, -1)
+    gradient, here = A @ left.ravel(), angles[_SWUNG, _AXES]
+    free = np.ones(len(A), bool)
+    free[:-3] = np.where(gradient[:-3] > 0, here < HIGH[_SWUNG, _AXES] - 1e-9, here > LOW[_SWUNG, _AXES] + 1e-9)
+    step = np.zeros(len(A))
+    step[free] = np.linalg.solve(A[free] @ A[free].T + 1e-4 * np.eye(free.sum()), gradient[free])
+    return step[:-3]
+
+
 # ------------------------------------------------------------------------------------ checks
 
 

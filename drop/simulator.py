@@ -39,6 +39,7 @@ from drop.body import (
     align,
     checked,
     checked_unit,
+    nearest_in_range,
     project_range_of_motion,
     swing_twist,
     twists,
@@ -446,8 +447,9 @@ class Simulator:
               springs : ((joint, joint, length [m], weight), …), such as a stiff knee's
               wrench_limit : the root wrench below which nothing is corrected [N, N m]; wrench_weight : w_p of Eq. 14
     ASSUMED   `restore`; only the part of the root wrench above `wrench_limit` is corrected (§8.5: down to mocap's
-              range); a limp body (no samples) has joint limits, whatever `limits` is, friction in its joints
-              (`project_friction`), and once it lies at rest (`at_rest`) stays where it is until something moves it
+              range); a limp body (no samples) has joint limits, whatever `limits` is
+              (`nearest_in_range`), friction in its joints (`project_friction`), and once it lies at rest (`at_rest`)
+              stays where it is until something moves it
     Raises    ValueError: a setting out of its range
     Test      tests/drop/test_drop.py::test_step_solves_equation_4, ::test_never_nan, ::test_switches,
               ::test_bad_settings
@@ -556,7 +558,7 @@ class Simulator:
                 choice = project_prior(x, samples)
             limited = 0.0
             if self.limits and not slow:
-                x_r = (project_range_of_motion if limp else self.limits)(x, twist())
+                x_r = (nearest_in_range if limp else self.limits)(x, twist())
                 limited = w.range_of_motion if np.abs(x_r - x).max() > 1e-9 else inside
                 rhs += limited * x_r
             if friction:
@@ -613,7 +615,9 @@ class Simulator:
         w, unit = self.w, 1.0 / STEP**2
         square = lambda r: float(np.sum(r * r))  # noqa: E731
         active, x_c = project_contact(x, x_t, self.obstacles, here)
-        if self.limits in (None, project_range_of_motion):  # measured even where it is switched off
+        if x_kin is None and self.limits:
+            x_r = nearest_in_range(x, twist, solved)
+        elif self.limits in (None, project_range_of_motion):  # measured even where it is switched off
             x_r = project_range_of_motion(x, twist, solved)
         else:
             x_r = self.limits(x, twist)

@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from drop import body, simulator
 from drop import prior as prior_module
-from drop import simulator
 from drop.body import (
     AXIS,
     DIFFERENCE,
@@ -39,6 +39,7 @@ from drop.body import (
     align,
     character_motion,
     forward_kinematics,
+    joint_angles,
     project_range_of_motion,
     swing,
     swing_twist,
@@ -326,6 +327,57 @@ def test_range_of_motion():
     assert (LOW[LIMITED] < HIGH[LIMITED]).all()
     left, right = J["hip_l"], J["hip_r"]
     assert LOW[left, 1] == -HIGH[right, 1] and LOW[left, 0] == LOW[right, 0]
+
+
+def spread_leg(out, flexed):
+    """Someone who stands, the right leg lifted sideways by `out` and forwards by `flexed` [degrees]."""
+    quat = REST.copy()
+    leg = Rotation.from_euler("yx", [-flexed, -out], degrees=True).as_quat(scalar_first=True)
+    quat[[J[f"{name}_r"] for name in ("hip", "knee", "ankle", "foot")]] = leg
+    return forward_kinematics(OFFSETS[0], quat)
+
+
+def test_a_limp_range_of_motion_is_an_energy():
+    """A leg led round a loop outside its limits gains nothing; clipped angles give it a third of all work."""
+    phase = np.linspace(0.0, 2.0 * np.pi, 201)
+    loop = [spread_leg(62.0 + 6.0 * np.cos(a), 130.0 + 6.0 * np.sin(a)) for a in phase]
+    moved, twist = np.diff(loop, axis=0), twists(REST)
+
+    def gain(project):
+        pull = np.array([project(x, twist) - x for x in loop])
+        return abs(np.sum(0.5 * (pull[1:] + pull[:-1]) * moved, axis=(1, 2)).sum())
+
+    assert gain(project_range_of_motion) > 0.02  # m², times w/h² a work: 240 J a round
+    assert gain(body.nearest_in_range) < 0.03 * gain(project_range_of_motion)
+
+
+def test_nearest_in_range():
+    """Inside its limits, of whole bones, no force, no torque, projected twice is once; no pose inside is nearer."""
+    x, twist, rng = spread_leg(66.0, 134.0), twists(REST), np.random.default_rng(0)
+    r = body.nearest_in_range(x, twist)
+    angles = joint_angles(r, twist)
+    assert (angles < HIGH + 1e-9)[LIMITED].all() and (angles > LOW - 1e-9)[LIMITED].all()
+    np.testing.assert_allclose(np.linalg.norm(DIFFERENCE @ r, axis=1), LENGTHS)
+    np.testing.assert_allclose((r - x).sum(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(np.cross(x - x.mean(axis=0), r - x).sum(axis=0), 0, atol=1e-10)
+    np.testing.assert_allclose(body.nearest_in_range(r, twist), r, atol=1e-9)
+    assert body.nearest_in_range(STAND, twist) is STAND
+    far, root = np.sum((r - x) ** 2), np.tile(np.eye(3), (N, 1, 1))
+    assert far < 0.1 * np.sum((project_range_of_motion(x, twist) - x) ** 2)
+    free = [(j, k) for j in LIMITED for k in (0, 1)] + [(9, 2)]
+    rows, columns = np.array(free).T
+
+    def distance(values):
+        other = np.zeros((N, 3))
+        other[rows, columns] = values
+        return np.sum((body._posed(other, root, x - x.mean(axis=0))[0] - x + x.mean(axis=0)) ** 2)
+
+    bounds = list(zip(LOW[rows, columns], HIGH[rows, columns], strict=True))
+    best = minimize(distance, angles[rows, columns], bounds=bounds, method="L-BFGS-B")
+    assert best.fun <= far < 1.05 * best.fun
+    for _ in range(20):
+        other = angles[rows, columns] + 0.05 * rng.standard_normal(len(free))
+        assert distance(np.clip(other, *np.array(bounds).T)) > far
 
 
 def test_range_of_motion_on_recorded_motion(mocap_dir):

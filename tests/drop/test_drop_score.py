@@ -61,6 +61,17 @@ def test_pushed_over(stage):
         assert score.pushed_over(stage, 1, 100) is None
 
 
+def test_every_particle_of_who_lies_is_still(monkeypatch):
+    """Whom the learned prior let fall lies still in all his particles within four seconds, and stays so.
+
+    The two who moved longest when joint limits clipped angles: for nine seconds at up to 5.6 m/s, and for six."""
+    felled = demos.Stage(demos.Options(prior="vae", range="vae"))
+    for number in (2, 7):
+        states = score.pushed_over(felled, number, 180, rise=False)
+        speed = np.linalg.norm([s.v for s in states], axis=-1)  # (180, 22)
+        assert speed.shape == (180, N) and speed[120:].max() < 0.05, number
+
+
 def test_command(monkeypatch, capsys, tmp_path):
     """Every key for both priors; what is wrong is told in one line."""
     monkeypatch.setattr(demos, "BUILTIN", (("walk", 6, {"speed": 1.2}), ("jog", 6, {"speed": 2.5})))
