@@ -16,7 +16,7 @@ leads there.
 
 An expert is a policy that learnt a few kinds of motion alone, steps backwards for example, and forgot the others
 meanwhile.  In sequences that are its own the student copies it, arms too, and in all others the old policy.  An average
-of their weights can do neither.
+of their weights does not step backwards (LOG.md, 2026-11-29).
 
 The student sees sensors alone, as ever.  Its normaliser stays as it was; its critic learns what the new actions are
 worth.
