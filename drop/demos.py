@@ -143,7 +143,8 @@ def measure(take):
         depth = max(float(-(s.x @ f.normal - f.offset - RADII).min()) for s, f in zip(states, take.floor))
         bones = np.abs(np.linalg.norm(np.einsum("kn,tnd->tkd", body.DIFFERENCE, x), axis=-1) / LENGTHS - 1)
         travel = np.linalg.norm(np.diff(x.mean(axis=1)[:, :2], axis=0), axis=1)
-        energy = {n: float(np.median([o.energies[n] for o in found])) for n in found[0].energies}
+        terms = dict.fromkeys(n for o in found for n in o.energies)  # a rag doll has friction, who is led direction
+        energy = {n: float(np.median([o.energies[n] for o in found if n in o.energies])) for n in terms}
         rows.append({
             "end": "fell" if down[-1] or long else "upright", "down": float(down.mean()),
             "limp": float(np.mean([o.sample < 0 for o in found])), "speed": float(travel.mean() / STEP),

@@ -93,6 +93,10 @@ def test_measure(stage):
     assert r["below_mm"] == pytest.approx(20 - 1e3 * (x + [0, 0, 0.02])[:, 2].__sub__(RADII).min(), abs=1e-6)
     assert r["end"] == "upright" and r["bone"] < 1e-9 and r["limp"] == 1.0
     assert "0.30 m/s" in demos.report(take)
+    state, found = Simulator().step(State(x, 0 * x, np.tile([1.0, 0, 0, 0], (N, 1))))
+    found.energies["direction"] = 2.0  # who is led until he falls: one frame has the term, the others do not
+    take.add([state], [found])
+    assert demos.measure(take)[0]["energies"]["direction"] == 2.0
 
 
 def test_ball_momentum(stage):
