@@ -236,8 +236,8 @@ class VaePrior:
     r"""The conditional VAE of drop/vae.py as a prior  [DROP Eqs. 8, 9].
 
     Equation  z ~ N(μ0(s), σ0(s)²) for the set of samples, z = μ0(s) for the mode; x̃ by forward kinematics of the
-              decoded rotations; feet that it says stand are planted (`plant`); on a slope the network is shown the
-              state on the level (`level_state`), and its answer goes back on the slope (`incline`)
+              decoded rotations; feet that it says stand are planted (`plant`); where a direction leads the
+              network is told the pace (`led`); on a slope it is shown the state on the level (`level_state`), and its answer goes back on the slope (`incline`)
     Args      net : drop.vae.MotionVAE; floor : Plane under the character or None; velocity : "own" (§7: what the prior
               itself predicted) or "solved" (differences of the solved positions); spread : standard deviation of the
               angle [rad] by which samples, not the mode, are turned about the pelvis, as NearestPrior's are; down :
@@ -265,7 +265,7 @@ class VaePrior:
         if inclined:
             state = level_state(self.floor, state)
         lift = np.array([0.0, 0.0, 0.0 if inclined else ground(self.floor, state.x)])
-        v = state.v if self.velocity == "solved" or state.v_own is None else state.v_own
+        v = led(state.v if self.velocity == "solved" or state.v_own is None else state.v_own, state.lead)
         here = state.x - lift - state.x[0] * [1, 1, 0]
         one = [np.asarray(a, np.float32)[None] for a in (here, vae.columns_of(state.quat), v)]
         x, columns, v, frame = vae.canonical(*one)
@@ -458,6 +458,27 @@ def plant(x_t, x, contacts, floor=0.0):
     leg[..., 2] += lift[..., 0]
     bone[..., 2] += lift[..., 1] - lift[..., 0]
     return bent_legs(x, x.copy(), leg, bone)
+
+
+GOING = 0.3  # m/s, ASSUMED: who is slower stands, and has no way along which he could be told to hurry
+
+
+def led(v, lead):
+    r"""Velocities as the learned prior is told them where Eq. 16 leads: the mean keeps its way, at the target's speed.
+
+    Equation  v_j + (‖v_tar‖/‖v̄‖ − 1) v̄ with v̄ the horizontal mean; v where nothing leads or ‖v̄‖ < GOING
+    Why       the prior reads what it predicted itself (§7), not what was solved.  Untold, it goes on walking at its own
+              pace: E_com drags the centre of mass past it, and feet that it has planted are torn loose (REPRODUCE.md,
+              a walker asked for 2.5 m/s).  Told to go the target's way, too, it falls in turns
+    ASSUMED   the paper leaves all to E_com and to HuMoR's samples; GOING
+    Args      v : (22, 3) [m/s]; lead : (2,) or None
+    Test      tests/drop/test_drop_vae.py::test_led
+    """
+    if lead is None:
+        return v
+    mean = v.mean(axis=0) * [1, 1, 0]
+    speed = np.linalg.norm(mean)
+    return v if speed < GOING else v + (np.linalg.norm(lead) / speed - 1.0) * mean
 
 
 def level_state(floor, state):

@@ -18,7 +18,7 @@ The character's body is in drop/body.py (§4, §7), motion priors in drop/prior.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -386,6 +386,7 @@ class State:
     quat   : (22, 4) global rotations
     frame  : steps since the start
     v_own  : (22, 3) velocities the prior itself predicted, not overwritten by differences of the solved x (§7)
+    lead   : (2,) the velocity that Eq. 16 asks for in this step, for priors to read; None where nothing leads
     """
 
     x: np.ndarray
@@ -393,6 +394,7 @@ class State:
     quat: np.ndarray
     frame: int = 0
     v_own: np.ndarray | None = None
+    lead: np.ndarray | None = None
 
     @property
     def com(self):
@@ -527,7 +529,7 @@ class Simulator:
         w, y = self.w, inertial_target(x_t, v_t, force)
 
         here = gaps(x_t, self.obstacles)
-        samples, rotations = self._ask(state, rng)
+        samples, rotations = self._ask(state if v_tar is None else replace(state, lead=v_tar), rng)
         if len(samples):  # row 0 is the mode, which belongs to the set: so E_kin = 0 in the first iteration
             x, choice = (samples[0] if self.start == "mode" else y), 0
         else:  # a rag doll: no prior, or one without an answer here

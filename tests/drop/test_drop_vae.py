@@ -11,12 +11,12 @@ from scipy.linalg import lstsq
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from drop import body, train, vae
+from drop import body, demos, train, vae
 from drop.__main__ import main
 from drop.body import LENGTHS, STEP, N
 from drop.keyposes import key_pose_motion
-from drop.prior import LEGS, WEIGHTS, NearestPrior, PoseRange, VaePrior, incline, load_networks, pose_angles
-from drop.score import stands
+from drop.prior import LEGS, WEIGHTS, NearestPrior, PoseRange, VaePrior, incline, led, load_networks, pose_angles
+from drop.score import hurried, stands
 from drop.simulator import Plane, Simulator, State
 from human import Clip, heading
 from mocap import gait
@@ -443,6 +443,28 @@ def test_who_stands_stays_over_his_feet(seed):
         state, _ = sim.step(state, rng=rng)
         off.append(np.linalg.norm((state.com - state.x[body.FEET].mean(axis=0))[:2]))
     assert stands(state) and max(off) < 0.15
+
+
+def test_led():
+    """The mean keeps its way and takes the target's speed, the rest stays; who stands or is not led is told nothing."""
+    v = RNG(0).normal(0.0, 0.3, (N, 3)) + [0.8, 0.6, 0.1]
+    out = led(v, np.array([0.0, -2.5]))
+    mean, was = out.mean(axis=0), v.mean(axis=0)
+    assert np.linalg.norm(mean[:2]) == pytest.approx(2.5) and mean[2] == pytest.approx(was[2])
+    np.testing.assert_allclose(mean[:2] / np.linalg.norm(mean[:2]), was[:2] / np.linalg.norm(was[:2]), atol=1e-12)
+    np.testing.assert_allclose(out - mean, v - was, atol=1e-12)
+    assert led(v, None) is v and led(v - was, np.array([1.0, 0.0])).mean() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_walker_who_is_asked_to_runs():
+    """Eq. 16 asks a walker for 2.5 m/s: he runs, flying between steps; he walked on at 1.8, feet torn loose."""
+    stage = demos.Stage(demos.Options(prior="vae", range="vae"))
+    take = hurried(stage)
+    last = [s[0].com[:2] for s in take.states[-60:]]
+    flies = np.mean([not o[0].active[body.FEET].any() for o in take.outcomes[-60:]])
+    (r,) = demos.measure(take)
+    assert np.linalg.norm(last[-1] - last[0]) / (59 * STEP) > 2.2 and flies > 0.4
+    assert r["end"] == "upright" and r["slide"] < 0.25
 
 
 def test_vae_prior():
