@@ -237,7 +237,8 @@ class VaePrior:
 
     Equation  z ~ N(μ0(s), σ0(s)²) for the set of samples, z = μ0(s) for the mode; x̃ by forward kinematics of the
               decoded rotations; feet that it says stand are planted (`plant`); where a direction leads the
-              network is told the pace (`led`); on a slope it is shown the state on the level (`level_state`), and its answer goes back on the slope (`incline`)
+              network is told the pace (`led`); on a slope it is shown the state on the level (`level_state`), and its
+              answer goes back on the slope (`incline`)
     Args      net : drop.vae.MotionVAE; floor : Plane under the character or None; velocity : "own" (§7: what the prior
               itself predicted) or "solved" (differences of the solved positions); spread : standard deviation of the
               angle [rad] by which samples, not the mode, are turned about the pelvis, as NearestPrior's are; down :
