@@ -509,7 +509,8 @@ def trip(stage, rng):
     """§8.2: the left heel of a walker and of a runner held for 1 s, caught as it swings past the other foot.
 
     ASSUMED   TRIP_WEIGHT.  The default leaves a fifth of the torque by which the prior holds the trunk upright, enough
-              for four of eight tripped walkers to stop and stand; with 1e-5 everywhere all who follow a direction fall in turns
+              for four of eight tripped walkers to stop and stand; with 1e-5 everywhere all who follow a direction fall
+              in turns
     Test      tests/drop/test_drop_demos.py::test_the_tripped_stumble
     """
     return [_trip(stage, stage.again(), speed) for speed in (1.2, 2.5)]
