@@ -3,8 +3,8 @@ r"""The environment: N characters, each driven by a headset and two controllers 
     action ──► torque ──► MuJoCo (its own thread pool, 4 × 1/120 s) ──► refresh ──► reward, termination ──► observation
 
     observe      Eqs. 2 to 4      what the actor sees: character and sensors, in the heading frame
-    privileged   §3.3             what only the critic sees: the human's full pose, now and in the future
-    distances    Eqs. 9 to 11     one a term of the reward (Eq. 8); Table 2 is in characters/NAME.toml
+                 §3.3             and what only the critic sees: the human's full pose, now and in the future
+    kernel       Eq. 8            a term of the reward, of the distances of Eqs. 9 to 11; Table 2: characters/NAME.toml
     ablated      §3.5.1, §4.3     the same with less reward; `headset_only` (§4.2) and `asymmetric` (§5.3): less to see
     Uniform      §3.6             where episodes start; another object with its three methods may stand in its place
     Env          §3.6, §3.7       reset and step as Gymnasium's vector environments have them
@@ -412,7 +412,7 @@ class Env:
             self._stand(ids[upright])
         if self.disturbance:
             self.disturbance.begin(self, ids)
-        self.action[ids], self.ctrl[ids], self.warmstart[ids] = 0.0, 0.0, 0.0
+        self.action[ids], self.ctrl[ids], self.warmstart[ids] = 0.0, 0.0, 0.0  # ASSUMED: a_{−1} = 0 in Eq. 9
         self.refresh(ids)
 
     def _stand(self, ids):
@@ -476,7 +476,7 @@ class Env:
         ends["clip"] = (f >= self.ref.last[self.sequence]) & ~terminated
         ends["time"] = (self.steps >= self.horizon) & ~terminated & ~ends["clip"]
         truncated = ends["clip"] | ends["time"]
-        reward = total_reward(terms) + np.where(terminated, self.char.reward["fail"], 0.0)
+        reward = total_reward(terms) + np.where(terminated, self.char.reward["fail"], 0.0)  # ASSUMED: −5 is added
         self.action[:] = a
         self.observe(slice(None))
         done = np.flatnonzero(terminated | truncated) if self.autoreset else ()
@@ -507,7 +507,7 @@ class Env:
         return bad
 
     def _contact(self):
-        """Feet whose normal force on the floor exceeds 1 N during the last substep.  (N, 2) bool
+        """Feet whose normal force on the floor exceeds 1 N during the last substep (ASSUMED: which, when).  (N, 2) bool
 
         To be called right after the physics: `refresh` computes no forces, and leaves in sensordata whatever simulation
         the thread ran before.

@@ -163,7 +163,8 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
 
     Frames lived count equally, whichever clip they are in; `completed` and `survival` say how many were lived.
     Joints are the bodies of the joint map; for positions and jitter the hands too.  The human's own figures are taken
-    before the scaling.  Contact and action are measured after steps, so not at the start.  In the field's own units
+    before the scaling.  Contact and action are measured after steps: the start's contact is taken to be the first
+    step's, or a character that is put on its feet would seem to land.  In the field's own units
     (`mocap.yardsticks`) the character is held against the human as the root's scale maps it, over the joints that both
     have; a sequence that failed is no success.
     Returns   key -> number; NaN where there was nothing to measure (no frame, no step, no metre travelled);
@@ -179,7 +180,7 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
     segments, deepest, rows = shared_segments(char), [], []
     turning = {s for s, body in segments.items() if m.body_jntnum[body]}
     for rec in recordings:
-        f = rec.frames
+        f, contact = rec.frames, rec.contact[[min(1, len(rec.contact) - 1), *range(1, len(rec.contact))]]
         sim = forward_kinematics(char, rec.qpos)
         kin = sim if np.array_equal(rec.qpos, ref.qpos[f]) else forward_kinematics(char, ref.qpos[f])
         rows.append((not rec.failed, (len(f) - 1) / rec.available if rec.available else 1.0))
@@ -203,14 +204,14 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
         pool.values("sip_deg", np.degrees(quat_angle(sim.xquat[:, sip], kin.xquat[:, sip])))
         _, speed = sole_motion(sim.soles, rate)
         pool.values("foot_slide_cm_s", 100 * speed[ref.contact[f]] if len(f) > 1 else [])
-        pool.values("own_slide_cm_s", 100 * own_slide(sim.soles, rec.contact, rate))
+        pool.values("own_slide_cm_s", 100 * own_slide(sim.soles, contact, rate))
         pool.values("penetration_mm", -1000 * sim.lowest[sim.lowest < 0])
         deepest.append(1000 * apart.overlap(rec.qpos[::EVERY]))
-        pool.values("contact_agreement", rec.contact[1:] == ref.contact[f[1:]])
+        pool.values("contact_agreement", contact[1:] == ref.contact[f[1:]])
         pool.add("jitter_m_s3", *jitter(sim.xpos[:, joints], rate))
         human = ref.human_pos[f].astype(float) / ref.scale[f, None]
         pool.add("human_jitter_m_s3", *jitter(human, rate))
-        pool.add("steps_per_m", footfalls(rec.contact), travelled(rec.qpos))
+        pool.add("steps_per_m", footfalls(contact), travelled(rec.qpos))
         pool.add("human_steps_per_m", footfalls(ref.contact[f]), travelled(human[:, 0]))
         wobble = head_rates(sim.xquat[:, char.head], rate) - head_rates(ref.orientation[f, 1], rate)
         pool.values("head_wobble_deg_s", np.degrees(wobble) ** 2 if len(f) > 2 else [])
@@ -353,7 +354,7 @@ def pd_action(env: Env):
 # ------------------------------------------------------------------------------------ pushes
 
 PUSH_SECONDS = 0.2
-RECOVERY = 3.0  # s after the push that the character must live, to have survived it
+RECOVERY = 3.0  # s from the push's beginning that the character must live, to have survived it
 DIRECTIONS = {"forward": 0.0, "left": np.pi / 2, "back": np.pi, "right": -np.pi / 2}
 
 
@@ -434,8 +435,8 @@ def push_report(found: dict, push: Push) -> str:
     """The largest pushes as text.  Test: tests/test_play.py::test_largest_push"""
     n = len(found["forward"])
     lines = [
-        f"largest push survived: {PUSH_SECONDS} s at {push.at} s, then {RECOVERY:.0f} s; up to {push.newtons:.0f} N, "
-        f"by {found['resolution']:.1f} N; {n} of {found['tried']} sequences live without one"
+        f"largest push survived: {PUSH_SECONDS} s at {push.at} s, lived {RECOVERY:.0f} s from then; up to "
+        f"{push.newtons:.0f} N, by {found['resolution']:.1f} N; {n} of {found['tried']} sequences live without one"
     ]
     for name in DIRECTIONS if n else ():
         k = found[name]

@@ -158,7 +158,8 @@ def headset(char: Character) -> np.ndarray:
     return data.site_xpos[char.sensor_sites[0]].copy()
 
 
-# From a standing human's hips to the headset, heading frame [m]: Bandai's actor and the built-in human, rounded
+# ASSUMED: from a standing human's hips to the headset, heading frame [m]: Bandai's actor and the built-in human's,
+# rounded
 HEADSET_AHEAD = np.array([0.14, 0.0, 0.0])
 
 

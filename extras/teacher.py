@@ -146,7 +146,8 @@ class Student(ppo.Trainer):
         super().__init__(opt, env, policy)
         self.old, _ = load_policy(opt.init)
         self.experts, self.whose = experts(opt.expert, env)
-        self.arms, self.teacher = taught(env.char, () if opt.expert else opt.joints), Teacher(env)
+        self.arms = taught(env.char, () if opt.expert else opt.joints)
+        self.teacher = Teacher(env) if len(self.arms) else None
         self.wanted, self.by_teacher = np.zeros_like(self.mu), np.zeros(self.mu.shape, bool)
         self.adam_pi.lr = opt.teacher_lr
 

@@ -96,7 +96,8 @@ class Curriculum(Uniform):
               A share `kinds` of the time and of the beginnings is shared out among kinds of motion by how often each
               fails, times the square root of its frames, and within a kind by frames × h, of beginnings by
               min(h / ⟨h⟩, MOST)  (`by_kind`)
-    Symbols   h failures a step, of late (`count`); ⟨h⟩ its mean over frames; H horizon; T steps of an episode
+    Symbols   h failures a step, of late (`count`); ⟨h⟩ its mean over frames, of beginnings over sequences; H horizon;
+              T steps of an episode
     Why       after a while most failures are in a few sequences, and a uniform draw spends its steps on the others;
               within them they are at a few places, such as the first steps of a run.  And a policy that has always been
               put into mid-motion has never set off.  What has few recordings is not what users do seldom: sixty

@@ -510,7 +510,7 @@ class Guard:
     Anchor    a headset that comes back, or moves between two rows, by more than 1 m has been teleported: the whole
               stream is then shifted and turned about the vertical, so that the headset goes on from where it was (its
               height only if that changed by more than 0.5 m)
-    Devices   with `devices` 1 there are no controllers: they hang beside the body, and nothing is lost
+    Devices   with `devices` 1 nothing is said of controllers; that they hang beside the body is the reader's work
     Frame     `to_world`'s, quaternion w, x, y, z; times from `Clock`
     Test      tests/headset/test_stream.py::test_zero_rows, test_nan_rows, test_frozen_sensor, test_drop_out,
               test_teleport,

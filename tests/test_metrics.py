@@ -1,6 +1,7 @@
 """Metrics: each against a slow loop, and on motions whose value is known; tables."""
 
 import json
+from collections import Counter
 from dataclasses import replace
 
 import mujoco
@@ -14,6 +15,7 @@ import character
 import metrics
 import retarget
 from env import too_far
+from headset.player import Ride
 from human import PARENTS, SEGMENTS, heading, quat_about, quat_mul
 from metrics import Recording
 from mocap.data import load
@@ -152,8 +154,9 @@ def test_metrics_against_slow_loop(char, ref):
                 depth = own_depth(m, sim, never)
                 depths.append(1000 * depth)
             if k:
+                before = rec.contact[max(k - 1, 1)]  # the start's is the first step's
                 for i in range(2):
-                    if rec.contact[k, i] and rec.contact[k - 1, i]:
+                    if rec.contact[k, i] and before[i]:
                         low = soles[k][i][:, 2].argmin()
                         way = soles[k][i][low] - soles[k - 1][i][low]
                         s["own_slide_cm_s"].append(100 * rate * np.hypot(*way[:2]))
@@ -167,7 +170,7 @@ def test_metrics_against_slow_loop(char, ref):
                 s["saturation"] += [float(abs(a) > 0.99) for a in rec.action[k]]
                 walked += np.hypot(*(rec.qpos[k] - rec.qpos[k - 1])[:2])
                 human_walked += np.hypot(*(ref.human_pos[f, 0] - ref.human_pos[f - 1, 0])[:2] / ref.scale[f, :2])
-                falls += sum(rec.contact[k, i] and not rec.contact[k - 1, i] for i in range(2))
+                falls += sum(rec.contact[k, i] and not before[i] for i in range(2))
                 human_falls += sum(ref.contact[f, i] and not ref.contact[f - 1, i] for i in range(2))
         last = len(rec.frames) - 1
         for k, f in enumerate(rec.frames):
@@ -585,6 +588,62 @@ def test_streamed(char, ref):
     one = metrics.streamed(char, nothing, [stand])
     assert one["completed"] == 0.0 and set(one) == set(row)
     assert row["success_phc"] == row["success_height"] == 0.0 and row["mpjpe_cm"] > 0
+
+
+def test_streamed_row_of_known_rides(char, monkeypatch):
+    """The row, of rides made by hand: one to the end, one with a failure, one with two; each number another way."""
+    walk, stand = (load("builtin", clips=c)[0] for c in ("walk_005", "stand_007"))
+    clips, rng = [stand[:90], walk[30:130], walk[200:280]], np.random.default_rng(0)
+    cuts, rides, streams = [[0], [0, 40], [0, 10, 30]], [], []
+    for clip in clips:  # a headset 5 cm above the human's: errors are against what the character was shown
+        pos, *rest = metrics.stream_of(char, clip)
+        streams.append((pos + [0.0, 0.0, 0.05], *rest))
+    shown = iter(streams)
+    monkeypatch.setattr(metrics, "stream_of", lambda *args: next(shown))
+    seen = retarget.reference(char, [s[2] for s in streams])
+    for start, last, stood in zip(seen.first, seen.last, cuts, strict=True):
+        t = last - start + 1
+        contact, action = rng.random((t, 2)) < 0.5, rng.uniform(-1, 1, (t, len(char.limits)))
+        anew = np.isin(np.arange(t), stood)
+        ends = Counter(fall=len(stood) - 1)
+        rides.append(Ride(seen.qpos[start : last + 1].copy(), contact, action, anew, ends, 0.0, 0.0))
+    monkeypatch.setattr(metrics, "ride", lambda *args: rides)
+    row = metrics.streamed(char, None, clips)
+
+    lengths = [len(s[0]) for s in streams]
+    assert (row["clips"], row["failures"]) == (3, 3) and row["completed"] == pytest.approx(1 / 3)
+    assert row["survival"] == pytest.approx((1 + 40 / lengths[1] + 10 / lengths[2]) / 3)
+    assert row["first_failure_s"] == pytest.approx(25 / 30) and row["fails_every_s"] == pytest.approx(
+        sum(lengths) / 30 / 3
+    )
+    head, hands, torque, agree, mj = [], [], [], [], mujoco.MjData(char.model)
+    for (pos, *_), r, start, stood in zip(streams, rides, seen.first, cuts, strict=True):
+        for t in range(len(pos)):
+            mj.qpos[:] = r.qpos[t]
+            mujoco.mj_kinematics(char.model, mj)
+            error = np.linalg.norm(mj.site_xpos[char.sensor_sites] - pos[t], axis=-1)
+            head.append(error[0])
+            hands += error[1:].tolist()
+            if t not in stood:  # contact and action are measured after steps
+                torque += (r.action[t] ** 2).tolist()
+                agree += (r.contact[t] == seen.contact[start + t]).tolist()
+    assert row["root_cm"] == pytest.approx(0.0, abs=1e-9)  # every life against its own frames
+    assert row["head_cm"] == pytest.approx(100 * np.mean(head)) and row["hands_cm"] == pytest.approx(
+        100 * np.mean(hands)
+    )
+    assert row["success_phc"] == row["success_height"] == pytest.approx(1 / 3)  # of captures, not of lives
+    assert row["torque_rms"] == pytest.approx(np.sqrt(np.mean(torque)))
+    assert row["contact_agreement"] == pytest.approx(np.mean(agree))
+
+
+def test_landing_is_no_step(char, ref):
+    """A character that is put on its feet makes no step by it, whatever the label of the start says."""
+    page, rec = still(char, ref)
+    rec.qpos[:, 0] = np.linspace(0.0, 1.0, len(rec.qpos))
+    rec.contact[1:] = True
+    assert metrics.measure(char, page, [rec])["steps_per_m"] == 0.0
+    rec.contact[10:20, 0] = False
+    assert metrics.measure(char, page, [rec])["steps_per_m"] == pytest.approx(1.0)
 
 
 def test_halves(ref):
