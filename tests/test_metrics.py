@@ -15,7 +15,7 @@ import character
 import metrics
 import retarget
 from env import too_far
-from headset.player import Ride
+from headset.player import Ride, recorded
 from human import PARENTS, SEGMENTS, heading, quat_about, quat_mul
 from metrics import Recording
 from mocap.data import load
@@ -575,6 +575,8 @@ def test_streamed(char, ref):
     assert np.linalg.norm(np.diff(pos[:13], axis=0), axis=-1).max() < 1e-9 < np.linalg.norm(pos[40] - pos[0])
     stand = load("builtin", clips="stand_007")[0][:90]
     assert abs(len(metrics.stream_of(char, stand)[0]) - (45 + 90 - 31)) <= 1  # begins still: no speeding up
+    long = load("builtin", clips="walk_005")[0]
+    assert long.seconds > 25 and recorded(long)[1].seconds == pytest.approx(20.0 + 1.5 + 0.75, abs=0.05)  # 20 s of it
 
     def nothing(obs):
         return np.zeros((len(obs), len(char.limits)))

@@ -690,7 +690,7 @@ def test_away_is_from_the_headset(jesse):
     player = Player(jesse, lambda obs: np.zeros((1, 33)))
     pos, quat = np.tile([3.0, -1.0, 1.4], (1, 3, 1)), np.tile([1.0, 0, 0, 0], (1, 3, 1))
     player.stand(pos, quat)
-    assert player._ends(pos - [1.05, 0, 0]) == ["away"] and player._ends(pos + [0.95, 0, 0]) == [None]
+    assert player._ends(pos - [1.001, 0, 0]) == ["away"] and player._ends(pos + [0.999, 0, 0]) == [None]
 
 
 def test_errors_are_distances(jesse):
@@ -726,7 +726,8 @@ def test_side_by_side(jesse, walk):
     ref = retarget.reference(jesse, [walk])
     act = lambda obs: 0.3 * np.sin(np.arange(len(jesse.limits)) + 5 * obs[:, :1])  # noqa: E731
     whole = ref.sensor_pos[:70], ref.sensor_quat[:70]
-    streams = [whole, (whole[0][5:45] + [0.5, 0, 0], whole[1][5:45]), whole]
+    part = whole[0][5:55] + [0.5, 0, 0], whole[1][5:55]  # long enough to be played beside the whole, which falls later
+    streams = [whole, part, whole, (whole[0][:30], whole[1][:30])]
     rides = ride(jesse, act, streams)
     for stream, found in zip(streams, rides):
         [alone] = ride(jesse, act, [stream], threads=1)
