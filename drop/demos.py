@@ -398,26 +398,42 @@ def projectiles(stage, rng):
 
 
 def collide(stage, rng):
-    """§8.2: two characters, each simulated alone with the other's spheres as obstacles."""
+    """§8.2: two characters, each simulated alone with the other's spheres as obstacles.
+
+    ASSUMED   people do not stick to each other (`Spheres.slippery`), and each wants to go on the way he went: Eq. 16
+              with the speed of his clip, and samples that turn as a follower's do.  Without a way of their own they
+              stand breast to breast for ever: the samples follow the state, and of who is stopped all samples stand
+    Test      tests/drop/test_drop_demos.py::test_collide, ::test_who_collides_goes_on
+    """
     takes = []
     for speeds, word in (((1.2, 1.2), "walk into walk"), ((2.5, 1.2), "run into walk")):
         pair = [stage.start(v, at=60 + 7 * i, place=((-1.5 - (v > 2), 0.1) if i == 0 else (1.5, -0.1)), turn=np.pi * i)
                 for i, v in enumerate(speeds)]  # fmt: skip
+        for sim, _ in pair:
+            turning(stage, sim)
         sims, states = [p[0] for p in pair], [p[1] for p in pair]
+        goals = [pace(pick_motion(stage.clips, v)[1]) * np.array([1.0 - 2.0 * i, 0.0]) for i, v in enumerate(speeds)]
         take = Take(word)
-        nearest = np.inf
+        nearest, touching = np.inf, 0
         for _ in range(150):
             for sim, other in zip(sims, reversed(states)):
-                sim.obstacles = (Plane(), Spheres(other.x, RADII))
-            steps = [sim.step(state, rng=rng) for sim, state in zip(sims, states)]
+                sim.obstacles = (Plane(), Spheres(other.x, RADII, slippery=True))
+            steps = [sim.step(state, v_tar=v, rng=rng) for sim, state, v in zip(sims, states, goals)]
             states = [s for s, _ in steps]
             apart = np.linalg.norm(states[0].x[:, None] - states[1].x, axis=-1) - RADII[:, None] - RADII
-            nearest = min(nearest, float(apart.min()))
+            nearest, touching = min(nearest, float(apart.min())), touching + (apart.min() < simulator.WRENCH_MARGIN)
             take.add(states, [o for _, o in steps])
         take.window = (15, 75)
         take.notes["deepest overlap of the two"] = f"{max(-100 * nearest, 0):.1f} cm"
+        take.notes["they touch"] = f"for {touching * STEP:.1f} s"
         takes.append(take)
     return takes
+
+
+def turning(stage, sim):
+    """Samples of the learned prior that turn, as those of nearest transitions do, where a direction leads."""
+    if isinstance(stage.general, VaePrior):
+        sim.prior.prior = VaePrior(stage.general.net, spread=0.3)
 
 
 def follow(stage, rng):
@@ -436,8 +452,7 @@ LEAD_STIFFNESS, LEAD_LIMIT = 200.0, 40.0  # N/m, N, ASSUMED: the hand that leads
 def _follow(stage, rng, speed, led, begin, frames=480):
     limit = simulator.WRENCH_LIMIT * (2.0 if speed >= RUN else 1.0)
     sim, state = stage.start(begin, wrench_limit=limit)
-    if isinstance(stage.general, VaePrior):
-        sim.prior.prior = VaePrior(stage.general.net, spread=0.3)
+    turning(stage, sim)
     yaw, ahead, reach = heading(state.quat[0]), 0.6 * speed, []
     way = lambda t: yaw + (t * STEP // 4) * np.pi / 2  # noqa: E731
     dot = state.com[:2] + ahead * np.array([np.cos(yaw), np.sin(yaw)])

@@ -127,10 +127,13 @@ class Plane:
 
 @dataclass(frozen=True)
 class Spheres:
-    """Solid spheres, such as another character's.  Test: tests/drop/test_drop.py::test_obstacles"""
+    """Solid spheres, such as another character's.
+
+    Test: tests/drop/test_drop.py::test_obstacles, ::test_contact_slips"""
 
     centre: np.ndarray  # (S, 3)
     radius: np.ndarray  # (S,)
+    slippery: bool = False  # contacts with them do not stick (`project_contact`)
 
     def distance(self, x):
         """Signed distance (K,) and outward normal (K, 3) of points (K, 3) to the nearest surface."""
@@ -192,12 +195,25 @@ def gaps(x, obstacles, radii=RADII):
     return gap - radii, normal
 
 
+def slips(x, obstacles, radii=RADII):
+    """Which particles (22,) have a slippery obstacle nearest.
+
+    Why       Eq. 6 holds a contact at its place in the world.  That is static friction of what stands still; another
+              person moves, and both would be nailed to where they touched
+    Test      tests/drop/test_drop.py::test_contact_slips"""
+    slippery = [o for o in obstacles if getattr(o, "slippery", False)]
+    if not slippery:
+        return np.zeros(len(x), bool)
+    return gaps(x, slippery, radii)[0] <= gaps(x, obstacles, radii)[0]
+
+
 def project_contact(x, x_t, obstacles, here=None):
     r"""Which particles are about to penetrate, and where they must stay.
 
     Equation  [DROP Eq. 6] S: gap of the solver's x below the margin; x_c = x_t moved along the normal to the nearest
               place without penetration: tangentially it is x_t, so contacts stick (static friction)
-    ASSUMED   the margin, the largest push, the speed that static friction holds (CONTACT_MARGIN, PUSH_OUT, SLIP)
+    ASSUMED   the margin, the largest push, the speed that static friction holds (CONTACT_MARGIN, PUSH_OUT, SLIP); what
+              is slippery (another person) has no friction: tangentially x_c is x (`slips`)
     Args      x, x_t : (22, 3) the solver's state and the current one; obstacles : list with `distance`;
               here : gaps(x_t, obstacles), if they are known already
     Returns   active : (22,) bool, the diagonal of S; x_c : (22, 3)
@@ -211,6 +227,7 @@ def project_contact(x, x_t, obstacles, here=None):
     move = move - along[:, None] * normal
     length = np.sqrt(np.einsum("ij,ij->i", move, move))
     slide = np.maximum(0.0, 1.0 - SLIP * STEP / np.maximum(length, 1e-9))
+    slide[slips(x_t, obstacles)] = 1.0
     out = np.maximum(np.minimum(np.maximum(-gap_t, 0.0), PUSH_OUT), along)  # nothing holds it down: no glue
     return active, x_t + out[:, None] * normal + slide[:, None] * move
 

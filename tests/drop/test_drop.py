@@ -269,6 +269,25 @@ def test_project_contact():
     np.testing.assert_allclose(plane.distance(x_c[active])[0] - RADII[active], 0.0, atol=1e-12)
 
 
+def test_contact_slips():
+    """Beside another person a particle is pushed out along the normal and slides freely; a wall would hold it."""
+    hand = J["wrist_l"]
+    x_t = STAND + [0.0, 0.0, 0.5]  # in the air: the sphere is all that is near
+    place = x_t[hand] + [0.0, RADII[hand] + 0.3 + 0.004, 0.0]
+    x = x_t.copy()
+    x[hand] += [0.01, 0.02, 0.0]
+    for slippery, along in ((False, 0.0), (True, 0.01)):
+        person = simulator.Spheres(place[None], np.array([0.3]), slippery)
+        active, x_c = simulator.project_contact(x, x_t, (Plane(), person))
+        assert active[hand]
+        np.testing.assert_allclose(x_c[hand] - x_t[hand], [along, 0.0, 0.0], atol=1e-12)
+    low = int(np.argmin(STAND[:, 2] - RADII))  # a foot on the floor sticks, although a person is slippery
+    stand = STAND - [0.0, 0.0, (STAND[:, 2] - RADII).min()]
+    moved = stand.copy()
+    moved[low, 0] += 0.01
+    np.testing.assert_allclose(simulator.project_contact(moved, stand, (Plane(), person))[1][low, 0], stand[low, 0])
+
+
 def test_project_prior():
     """Eq. 10 against a loop."""
     samples = np.stack([jiggled(k) for k in range(20)])

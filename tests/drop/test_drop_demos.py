@@ -221,6 +221,21 @@ def test_collide(full):
         assert apart.min() < 0.8  # they did meet
 
 
+@pytest.mark.parametrize("prior", ["nearest", "vae"])
+def test_who_collides_goes_on(all_clips, monkeypatch, prior):
+    """They bump, get past each other and are soon apart, upright; nobody walks through the other."""
+    if prior == "vae":
+        monkeypatch.setattr(all_clips, "general", VaePrior(load_networks()[0]))
+        monkeypatch.setattr(all_clips.opt, "prior", "vae")
+    for take in demos.collide(all_clips, np.random.default_rng(1)):
+        com = np.array([[s.com[:2] for s in states] for states in take.states])
+        apart = np.linalg.norm(com[:, 0] - com[:, 1], axis=1)
+        assert 0 < numbers(take.notes["they touch"])[0] < 1.5
+        assert com[0, 0, 0] < com[0, 1, 0] - 2 and com[-1, 0, 0] > com[-1, 1, 0] + 2
+        assert 0.2 < apart.min() < 0.6
+        assert [r["end"] for r in demos.measure(take)] == ["upright", "upright"]
+
+
 def test_constrain(full):
     """An energy holds the hand at its place, a force comes nearer; let go, the hand leaves it."""
     force, energy = (numbers(t.notes["hand to its place"]) for t in full("constrain"))
