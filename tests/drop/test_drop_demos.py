@@ -124,8 +124,20 @@ def test_escape(stage):
     """Across a ball's path, not along it; nothing to flee from, nothing to do."""
     _, state = stage.start(0.0)
     coming = demos.Ball(state.com + [4.0, 0, 0], np.array([-9.0, 0, 0]))
-    v = demos.escape(state, [coming])
-    assert abs(v[1]) > abs(v[0]) and np.linalg.norm(v) == pytest.approx(1.4)
+    lead = demos.escape(state, [coming], lead=np.zeros(2))
+    assert abs(lead[1]) > abs(lead[0]) and np.linalg.norm(lead) == pytest.approx(demos.DODGE * STEP)  # no jump
+    for _ in range(20):
+        before, lead = lead, demos.escape(state, [coming], lead=lead)
+        assert np.linalg.norm(lead - before) <= demos.DODGE * STEP + 1e-12
+    assert np.linalg.norm(lead) == pytest.approx(1.4)
+    v, way, x, h = np.array([1.0, 0.2]), np.array([-0.5, 1.0]), np.zeros(2), 1e-4
+    for i in range(8000):  # `ramp` against small steps; at 3 m/s² the change takes 0.57 s
+        change = way - v
+        v = v + change * min(1.0, 3.0 * h / max(np.linalg.norm(change), 1e-9))
+        x = x + h * v
+        if i in (2999, 7999):
+            speed, gone = demos.ramp(np.array([1.0, 0.2]), way, (i + 1) * h, 3.0)
+            np.testing.assert_allclose(np.append(speed, gone), np.append(v, x), atol=1e-3)
     assert demos.escape(state, [demos.Ball(state.com + [4.0, 0, 0], np.array([9.0, 0, 0]))]) is None
     assert demos.escape(state, []) is None
 
@@ -202,14 +214,28 @@ def test_every_demo(name, stage, monkeypatch):
 
 
 def test_projectiles(full):
-    """Most of the balls hit a walker, who feels them; one who dodges is hit by fewer."""
+    """Most of the balls hit a walker, who feels them; one who dodges is hit by fewer, and is not dragged."""
     plain, dodging = full("projectiles")
     hit, thrown = numbers(plain.notes["balls that hit"])
-    assert thrown == 6 and hit >= 4 and numbers(dodging.notes["balls that hit"])[0] < hit / 2
+    assert thrown == 6 and hit >= 4 and numbers(dodging.notes["balls that hit"])[0] <= hit - 2
+    who_is_not_dragged(dodging)
     pushed = [t for t, arrows in enumerate(plain.arrows) if arrows]
     assert pushed and any(plain.window[0] <= t <= plain.window[1] for t in pushed)  # the sheet shows a hit
     shown = np.linspace(*plain.window, 9).round().astype(int)
     assert max(np.linalg.norm(f) for t in shown for _, f in plain.arrows[t]) > 50  # and its force
+
+
+def who_is_not_dragged(dodging):
+    (r,) = demos.measure(dodging)
+    assert r["end"] == "upright" and r["slide"] < 0.22 and numbers(dodging.notes["root wrench"])[0] < 30
+
+
+def test_a_dodger_with_the_learned_prior_stays_on_his_feet(all_clips, monkeypatch):
+    """With targets that jumped he fell in two of four takes, or slid at 0.3 m/s under a root wrench of 37 N."""
+    monkeypatch.setattr(all_clips, "general", VaePrior(load_networks()[0]))
+    monkeypatch.setattr(all_clips.opt, "prior", "vae")
+    for seed in (1, 2):
+        who_is_not_dragged(demos.projectiles(all_clips, np.random.default_rng(seed))[1])
 
 
 def test_collide(full):
@@ -223,16 +249,17 @@ def test_collide(full):
 
 @pytest.mark.parametrize("prior", ["nearest", "vae"])
 def test_who_collides_goes_on(all_clips, monkeypatch, prior):
-    """They bump, get past each other and are soon apart, upright; nobody walks through the other."""
+    """They bump, get past each other and are soon apart, upright; the whole trunk passes on one side."""
+    trunk = [J[n] for n in ("pelvis", "spine1", "spine2", "spine3", "neck", "head")]
     if prior == "vae":
         monkeypatch.setattr(all_clips, "general", VaePrior(load_networks()[0]))
         monkeypatch.setattr(all_clips.opt, "prior", "vae")
     for take in demos.collide(all_clips, np.random.default_rng(1)):
-        com = np.array([[s.com[:2] for s in states] for states in take.states])
-        apart = np.linalg.norm(com[:, 0] - com[:, 1], axis=1)
+        ahead = np.array([a.x[trunk] - b.x[trunk] for a, b in take.states])
         assert 0 < numbers(take.notes["they touch"])[0] < 1.5
-        assert com[0, 0, 0] < com[0, 1, 0] - 2 and com[-1, 0, 0] > com[-1, 1, 0] + 2
-        assert 0.2 < apart.min() < 0.6
+        assert ahead[0, :, 0].max() < -2 and ahead[-1, :, 0].min() > 2
+        sides = [a[int(np.argmax(a[:, 0] > 0)), 1] for a in np.swapaxes(ahead, 0, 1)]
+        assert len(set(np.sign(sides))) == 1
         assert [r["end"] for r in demos.measure(take)] == ["upright", "upright"]
 
 
