@@ -401,7 +401,7 @@ def projectiles(stage, rng):
                 if np.abs(f).max() > 1:
                     seen.add(i)
                 force += f
-            lead[0] = escape(state, balls, lead=lead[0]) if dodge else None
+            lead[0] = escape(state, balls, lead=lead[0]) if dodge and not fallen(state) else None
             return force, {"v_tar": lead[0]}, [(b.x, b.radius, (0.9, 0.6, 0.1, 1)) for b in balls]
 
         take = single("projectiles" + (" dodging" if dodge else ""), sim, state, 210, rng, act)

