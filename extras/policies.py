@@ -116,6 +116,9 @@ def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     kept = {"policy": meta["policy"], "steps": total_steps(meta), "data": meta["data"]}
     kept["options"] = meta["options"] | {"motion": ",".join(map(data.set_name, sets)), "out": None, "init": None}
     kept["options"] |= {"players": None}  # among the motions now
+    if experts := meta["options"].get("expert"):  # PATTERN=FILE: its name, no folder of this machine
+        pairs = [str(one).partition("=") for one in experts]
+        kept["options"]["expert"] = [f"{pattern}={Path(file).name}" for pattern, _, file in pairs]
     policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})
     kept |= {"gain": gain} if gain != 1.0 else {}
     if blend:

@@ -43,6 +43,11 @@ def test_ship(tmp_path, monkeypatch):
     more = policies.ship(tmp_path / "more", tmp_path / "more.npz")
     assert more["steps"] == 32 == total_steps(load_policy(tmp_path / "more")[1]) and not more["options"]["init"]
     assert policies.ship(tmp_path / "both", target)["licence"] == meta["licence"]
+    student, told = load_policy(tmp_path / "run")
+    told["options"]["expert"] = [f"*_run_*={tmp_path}/expert.npz", "back_*=other.npz"]
+    save_checkpoint(tmp_path / "student.npz", student.arrays(), told)
+    shipped = policies.ship(tmp_path / "student.npz", tmp_path / "shipped.npz")
+    assert shipped["options"]["expert"] == ["*_run_*=expert.npz", "back_*=other.npz"]
     assert load_policy(target)[1]["options"]["motion"] == "builtin,motion,standing"
     with pytest.raises(UserError):
         policies.ship(tmp_path / "nothing", target)
