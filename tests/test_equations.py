@@ -312,10 +312,17 @@ def test_eq_8_every_term_by_its_distance(env, rng):
     terms = env.reward_terms(a)
     for n in range(N):
         q = sum((env.qpos[n, 7 + i] - ref.qpos[t[n], 7 + i]) ** 2 for i in range(c.j)) / c.j
-        ẋ = [velocity(fresh(env, n), b)[1] for b in c.reward_links]
-        d = dict(q=q, xd=np.mean(np.sum((ẋ - ref.link_vel[t[n]]) ** 2, axis=1)),
+        mj = fresh(env, n)
+        q̇ = np.mean((env.qvel[n, 6:] - ref.qvel[t[n], 6:]) ** 2)
+        x = np.mean(np.sum((mj.xpos[c.reward_links] - ref.link_pos[t[n]]) ** 2, axis=1))
+        turns = [Rotation.from_quat(np.roll(p, -1)).inv() * Rotation.from_quat(np.roll(r, -1))
+                 for p, r in zip(mj.xquat[[c.root, c.head]], ref.orientation[t[n]], strict=True)]  # fmt: skip
+        ẋ = [velocity(mj, b)[1] for b in c.reward_links]
+        angle = np.mean([turn.magnitude() for turn in turns])
+        d = dict(q=q, qd=q̇, x=x, orientation=angle, xd=np.mean(np.sum((ẋ - ref.link_vel[t[n]]) ** 2, axis=1)),
                  contact=np.linalg.norm(1.0 * env.contact[n] - ref.contact[t[n]]),
                  action_diff=np.mean((a[n] - env.action[n]) ** 2), action_min=np.mean(a[n] ** 2))  # fmt: skip
+        assert set(d) == set(terms)
         for name, distance in d.items():
             w, k = c.reward[name]
             assert terms[name][n] == pytest.approx(w * math.exp(-k * distance), rel=1e-4), name
