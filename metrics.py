@@ -180,7 +180,7 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
     segments, deepest, rows = shared_segments(char), [], []
     turning = {s for s, body in segments.items() if m.body_jntnum[body]}
     for rec in recordings:
-        f, contact = rec.frames, rec.contact[[min(1, len(rec.contact) - 1), *range(1, len(rec.contact))]]
+        f, contact = rec.frames, np.concatenate([rec.contact[1:2], rec.contact[1:]])
         sim = forward_kinematics(char, rec.qpos)
         kin = sim if np.array_equal(rec.qpos, ref.qpos[f]) else forward_kinematics(char, ref.qpos[f])
         rows.append((not rec.failed, (len(f) - 1) / rec.available if rec.available else 1.0))
