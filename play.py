@@ -364,6 +364,7 @@ def play_figure(opt: Options) -> None:
     from plumbing import render
 
     check_folders(opt.png, opt.video, read=mocap.data.parts(opt.motion))
+    render.check_video(opt.video)
     _, long = metrics.motion_of(opt)
     clip = chosen(long, opt)
     arms, columns = metrics.arms_of([clip], opt), [c for c in metrics.COLUMNS if c[0] in OF_FIGURE]
@@ -652,6 +653,10 @@ def check_options(opt: Options, argv) -> None:
         raise UserError("--json tells of recordings, not of a live stream; valid: a .csv or .bsor file, or a folder")
     parse_push(opt.push)
     check_folders(opt.json, opt.png, opt.video, opt.bvh, read=(*mocap.data.parts(opt.motion), opt.stream, opt.policy))
+    if opt.video:
+        from plumbing import render
+
+        render.check_video(opt.video)
 
 
 def told_life(name, recording) -> str:

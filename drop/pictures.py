@@ -120,5 +120,4 @@ def check_outputs(opt):
     for path in map(Path, filter(None, (opt.png, opt.video))):
         if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
             raise UserError(f"cannot write {path}: give a file in a folder that exists and is writable")
-    if opt.video:
-        render.extra("imageio")
+    render.check_video(opt.video)

@@ -312,6 +312,21 @@ def extra(name):
         raise UserError(f"{name} is not installed: python -m pip install -e '.[view]'") from None
 
 
+def check_video(path):
+    """Before the slow work: can a video be written, by its name and the extra `view`?  path None: none is asked for
+
+    Returns   the module that writes it
+    Raises    UserError: another suffix, or the extra `view` is missing
+    Test      tests/plumbing/test_render.py::test_video_is_checked_first
+    """
+    if path is None:
+        return None
+    if Path(path).suffix != ".mp4":
+        raise UserError(f"cannot write video {path}: valid names end in .mp4")
+    extra("imageio_ffmpeg")
+    return extra("imageio.v2")
+
+
 def write_video(path, frames, fps=36):
     """Write an .mp4, whole or not at all.
 
@@ -319,10 +334,7 @@ def write_video(path, frames, fps=36):
     Raises    UserError: another suffix, no frame, the extra `view` is missing, or the folder cannot be written
     Test      tests/plumbing/test_render.py::test_video
     """
-    if Path(path).suffix != ".mp4":
-        raise UserError(f"cannot write video {path}: valid names end in .mp4")
-    extra("imageio_ffmpeg")
-    imageio = extra("imageio.v2")
+    imageio = check_video(path)
     if not Path(path).absolute().parent.is_dir():
         raise UserError(f"cannot write {path}: give a folder that exists and is writable")
     count = 0

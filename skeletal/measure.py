@@ -39,7 +39,7 @@ class MeasureOptions:
     motion: str | None = arg(None, "folder that holds bandai, lafan1, cmu; left out: the built-in human on all others")
     limit: int = arg(3, "clips a pair at most", check=COUNT)
     json: str | None = arg(None, "write the figures here")
-    png: str | None = arg(None, "folder for a sheet a pair: source, result over truth")
+    png: str | None = arg(None, "folder, made if need be, for a sheet a pair: source, result over truth")
     every: float = arg(0.6, "seconds between the pictures of a sheet", check=POSITIVE)
 
 
@@ -140,7 +140,8 @@ def averaged(rows) -> dict:
 def sheets(net: Correction, found, opt):
     """One contact sheet a pair: the source, and the result after the clean-up over the truth.
 
-    Raises    UserError: no such folder, or no OpenGL"""
+    Raises    UserError: no OpenGL"""
+    Path(opt.png).mkdir(exist_ok=True)
     drawn = set()
     for name, source, m, target, true in found:
         if name not in drawn:
@@ -177,7 +178,7 @@ def summary(pairs) -> dict:
 def measure(argv) -> int:
     """python -m skeletal measure.  Test: tests/skeletal/test_skeletal_correct.py::test_measure"""
     opt = cli(MeasureOptions, argv, "python -m skeletal measure", MeasureOptions.__doc__)
-    check_folders(opt.json, Path(opt.png) / "sheet.png" if opt.png else None)
+    check_folders(opt.json, opt.png)
     nets = [Correction(p) for p in opt.weights.split(",")]
     if any(n.names != nets[0].names for n in nets):
         raise UserError(f"--weights {opt.weights}: trained on different rigs; valid: seeds of one training")

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 import mocap.data
+from plumbing import render
 from plumbing.cli import COUNT, POSITIVE, UserError, arg, cli
 from plumbing.files import atomic_write, check_folders
 from plumbing.runs import latest_checkpoint, load_checkpoint, versions
@@ -127,6 +128,7 @@ def retarget(argv) -> int:
     if not opt.source or not opt.target or not (opt.out or opt.png or opt.video):
         raise UserError("give --source FILE.bvh, --target FILE.bvh (or B/0), and --out FILE.bvh, --png or --video")
     check_folders(opt.out, opt.png, opt.video, read=(opt.source, opt.target, opt.weights))
+    render.check_video(opt.video)
     family = opt.target[:2] in ("A/", "B/") or len(opt.target.partition("/")[0]) == 1
     weights = opt.weights or (SHIPPED if family else correct.SHIPPED)
     if not Path(weights).is_dir() and "rigs" in load_checkpoint(weights)[1]:
@@ -226,7 +228,7 @@ class FamilyOptions:
     limit: int = arg(12, "held-out clips at most, evenly chosen", check=COUNT)
     characters: int = arg(2, "unseen characters a structure", check=COUNT)
     seed: int = arg(1, "seed of their proportions")
-    png: str | None = arg(None, "folder for contact sheets of source, result and truth")
+    png: str | None = arg(None, "folder, made if need be, for contact sheets of source, result and truth")
     sheets: int = arg(3, "clips drawn there", check=COUNT)
     every: float = arg(0.6, "seconds between the pictures of a sheet", check=POSITIVE)
     json: str | None = arg(None, "write the figures here")
@@ -240,7 +242,7 @@ best of the three copies; slide: mean speed of standing feet [cm/s], retargeted,
 def families(argv) -> int:
     """python -m skeletal families: errors x 1000.  Test: tests/skeletal/test_skeletal_play.py::test_measure_command"""
     opt = cli(FamilyOptions, argv, "python -m skeletal families", FamilyOptions.__doc__)
-    check_folders(opt.json, Path(opt.png) / "sheet.png" if opt.png else None)
+    check_folders(opt.json, opt.png)
     nets = {name: Retargeter(name) for name in opt.weights.split(",")}
     cases = held_out(opt, next(iter(nets.values())))
     results = {"copies": copies(cases), "shifted": shifted(cases, next(iter(nets.values())))}
@@ -332,8 +334,9 @@ def shifted(cases, net) -> dict:
 def sheets(cases, net, opt):
     """Contact sheets of cross retargetings, evenly chosen: source, result after the clean-up, truth.
 
-    Raises    UserError: no such folder, or no OpenGL
+    Raises    UserError: no OpenGL
     Test      tests/skeletal/test_skeletal_play.py::test_sheets"""
+    Path(opt.png).mkdir(exist_ok=True)
     cross = [c for c in cases if c[0] == "cross"]
     for i in np.unique(np.linspace(0, len(cross) - 1, opt.sheets).astype(int)):
         _, a, m, b, true = cross[i]

@@ -274,6 +274,15 @@ def test_missing_extra_is_named(name, monkeypatch, tmp_path):
             render.write_video(tmp_path / "a.mp4", [])
 
 
+def test_video_is_checked_first(monkeypatch, tmp_path):
+    assert render.check_video(None) is None
+    with pytest.raises(UserError, match="valid names end in .mp4"):
+        render.check_video(tmp_path / "a.avi")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(UserError, match=r"pip install -e '\.\[view\]'"):
+        render.check_video(tmp_path / "a.mp4")
+
+
 def test_plot_curves(tmp_path):
     pytest.importorskip("matplotlib", reason="matplotlib (extra view) draws curves")
     files = []

@@ -103,7 +103,7 @@ def test_nothing_read_is_overwritten(trained, tmp_path, capsys):
         assert run("retarget", "--weights", trained / "run", "--source", a, "--target", b, "--out", out) == 2
         assert f"cannot write {out}: it is {why}" in capsys.readouterr().err
     assert a.read_bytes() == before == b.read_bytes() and kept.read_text() == "mine"
-    assert run("families", "--weights", trained / "run", "--png", tmp_path / "none") == 2
+    assert run("families", "--weights", trained / "run", "--png", tmp_path / "none" / "b") == 2
     assert "there is no folder" in (said := capsys.readouterr()).err and "copy" not in said.out
 
 
@@ -284,12 +284,12 @@ def test_shifted_copy(trained):
 def test_sheets(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(motions, "load", lambda *a, **k: CLIPS[:1])
     net = play.Retargeter(trained / "run")
-    opt = play.FamilyOptions(png=str(tmp_path), sheets=1, every=1.0)
+    opt = play.FamilyOptions(png=str(tmp_path / "made"), sheets=1, every=1.0)
     try:
         play.sheets(play.held_out(opt, net), net, opt)
     except UserError as e:
         pytest.skip(f"no software OpenGL: {e}")
-    assert [p.stat().st_size > 5000 for p in tmp_path.glob("*-AB.png")] == [True]
+    assert [p.stat().st_size > 5000 for p in (tmp_path / "made").glob("*-AB.png")] == [True]
 
 
 def test_noise():
