@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from nn import Adam
-from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, arg, cli
+from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli
 from plumbing.files import atomic_write
 from plumbing.runs import Progress, check_run, load_checkpoint, open_run, save_checkpoint, versions
 from skeletal import data
@@ -42,7 +42,7 @@ class AutoOptions:
     drop: str = arg("", "joints to leave out with all below them")
     up: str = arg("y", "axis of the files that points up", choices=("x", "y", "z", "-x", "-y", "-z"))
     limit: int = arg(200, "clips at most, evenly chosen", check=COUNT)
-    held: int = arg(20, "held-out clips at most", check=COUNT)
+    held: int = arg(20, "held-out clips at most, of known styles and of an unknown one", check=COUNT)
     out: str | None = arg(None, "run folder; default runs/autoencode")
     resume: bool = arg(False, "continue: networks that are finished are not trained again")
     steps: int = arg(600, "optimiser steps a network at most", check=COUNT)
@@ -86,7 +86,7 @@ def autoencode(argv) -> int:
     domain = Domain([skeleton], [(0, replace(m, skeleton=skeleton)) for m in motions], structure=structure)
     # One deviation for all quaternions: by its own, a joint that hardly moves would see a zero 50 deviations away.
     domain.std[:, 3:] = np.sqrt(np.mean(domain.std[:, 3:] ** 2))
-    _, held = base_motions(opt, "validation", opt.held)
+    sets = held_out(opt)
     open_run(out, asdict(opt), opt.resume)
     table, curves = {}, {}
     for seed in opt.seeds:
@@ -100,22 +100,37 @@ def autoencode(argv) -> int:
                 curve = _fit(net, domain, opt, seed, f"{kind} {seed}")
                 save_checkpoint(path, {"theta": net.theta}, {"curve": curve})
             curves[f"{kind}_{seed}"] = curve
+            for of, held in sets.items():
+                for noise in NOISES:
+                    table[f"{of}{kind}_{noise}_{seed}"] = 1e3 * _rebuild(net, domain, held, noise, opt, seed)
+                figures = "  ".join(f"{n} {table[f'{of}{kind}_{n}_{seed}']:.4f}" for n in NOISES)
+                print(f"{of}{kind}, seed {seed}: {figures} ({net.n_params} weights, {curve[-1][0]} steps)", flush=True)
+        for of, held in sets.items():
             for noise in NOISES:
-                table[f"{kind}_{noise}_{seed}"] = 1e3 * _rebuild(net, domain, held, noise, opt, seed)
-            figures = "  ".join(f"{n} {table[f'{kind}_{n}_{seed}']:.3f}" for n in NOISES)
-            print(f"{figures} ({kind}, seed {seed}, {net.n_params} weights, {len(curve)} points of its curve)")
+                table[f"{of}input_{noise}_{seed}"] = 1e3 * _rebuild(None, domain, held, noise, opt, seed)
+    for of, held in sets.items():
+        table[f"{of}mean_pose"] = mean = mean_pose_error(domain, held)
         for noise in NOISES:
-            table[f"input_{noise}_{seed}"] = 1e3 * _rebuild(None, domain, held, noise, opt, seed)
-    mean = mean_pose_error(domain, held)
-    for noise in NOISES:
-        row = {k: float(np.mean([table[f"{k}_{noise}_{s}"] for s in opt.seeds])) for k in ("input", *KINDS)}
-        table |= {f"{k}_{noise}": v for k, v in row.items()}
-        figures = "  ".join(f"{k} {v:.3f}" for k, v in row.items())
-        print(f"{noise:9s} {figures}  mean pose {mean:.3f}   ((p - p_true) / height)^2 x 1000")
+            row = {k: float(np.mean([table[f"{of}{k}_{noise}_{s}"] for s in opt.seeds])) for k in ("input", *KINDS)}
+            table |= {f"{of}{k}_{noise}": v for k, v in row.items()}
+            figures = "  ".join(f"{k} {v:.4f}" for k, v in row.items())
+            print(f"{of}{noise}: {figures}  mean pose {mean:.3f}   ((p - p_true) / height)^2 x 1000")
     if opt.json:
-        table |= {"mean_pose": mean, "curves": curves, "versions": versions()}
+        table |= {"curves": curves, "versions": versions()}
         atomic_write(opt.json, json.dumps(table, indent=2) + "\n")
     return 0
+
+
+def held_out(opt) -> dict:
+    """Motions no network was trained on: "" clips of styles it knows, "style_" a style it does not, where there is one.
+
+    Test: tests/skeletal/test_skeletal_play.py::test_autoencode_command"""
+    sets = {"": base_motions(opt, "validation", opt.held)[1]}
+    try:
+        sets["style_"] = base_motions(opt, "style", opt.held)[1]
+    except UserError:  # the folder has none
+        pass
+    return sets
 
 
 def network(parents, kind, seed) -> Generator:

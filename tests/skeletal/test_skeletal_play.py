@@ -324,9 +324,25 @@ def test_autoencode_command(tmp_path, monkeypatch, capsys):
     first = json.loads((tmp_path / "a.json").read_text())
     assert {f"{k}_{n}" for k in ("skeletal", "plain") for n in ("clean", "gaussian", "zeros")} <= set(first)
     assert first["skeletal_zeros"] > first["skeletal_clean"] > 0
+    assert {"style_input_zeros", "style_plain_gaussian_0", "style_mean_pose"} <= set(first)
     capsys.readouterr()
     assert run(*args, "--resume") == 0 and "steps skeletal" not in capsys.readouterr().out
     assert json.loads((tmp_path / "a.json").read_text()) == first
+
+
+def test_held_out_without_a_style(monkeypatch):
+    """A folder of which no style is held out is measured on its held-out clips alone."""
+    opt = autoencode.AutoOptions(held=2)
+    monkeypatch.setattr(motions, "load", lambda *a, **k: CLIPS)
+    assert {k: len(v) for k, v in autoencode.held_out(opt).items()} == {"": 2, "style_": 2}
+
+    def load(*a, split="all", **k):
+        if split == "style":
+            raise UserError("no clip")
+        return CLIPS
+
+    monkeypatch.setattr(motions, "load", load)
+    assert list(autoencode.held_out(opt)) == [""]
 
 
 def test_small_trainer_is_small():
