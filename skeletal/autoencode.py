@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from nn import Adam
-from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli
+from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli, given_flags
 from plumbing.files import atomic_write
-from plumbing.runs import Progress, check_run, load_checkpoint, open_run, save_checkpoint, versions
+from plumbing.runs import Progress, check_run, load_checkpoint, open_run, save_checkpoint, stored_options, versions
 from skeletal import data
 from skeletal.layers import PLACE, fk_forward
 from skeletal.layers import fk_backward as fk_grad
@@ -81,6 +81,8 @@ def autoencode(argv) -> int:
     opt = cli(AutoOptions, argv, "python -m skeletal autoencode", AutoOptions.__doc__)
     out = Path(opt.out or "runs/autoencode")
     check_run(out, opt.resume)
+    if opt.resume:
+        opt = resumed(opt, argv, out)
     structure, motions = base_motions(opt, "train", opt.limit)
     skeleton = motions[0].skeleton
     domain = Domain([skeleton], [(0, replace(m, skeleton=skeleton)) for m in motions], structure=structure)
@@ -119,6 +121,22 @@ def autoencode(argv) -> int:
         table |= {"curves": curves, "versions": versions()}
         atomic_write(opt.json, json.dumps(table, indent=2) + "\n")
     return 0
+
+
+AGAIN = {"resume", "out", "json", "held", "seeds"}  # what may differ when a run is measured again or gets more seeds
+
+
+def resumed(opt, argv, out) -> AutoOptions:
+    """The run's own options, with those of AGAIN that are given now.
+
+    Raises    UserError: another flag is given, with another value
+    Test      tests/skeletal/test_skeletal_play.py::test_autoencode_command"""
+    given = {name: getattr(opt, name) for name in given_flags(argv)}
+    own = replace(AutoOptions(**stored_options(AutoOptions, out)), **{k: v for k, v in given.items() if k in AGAIN})
+    if other := sorted(k for k, v in given.items() if v != getattr(own, k)):
+        valid = ", --".join(sorted(AGAIN))
+        raise UserError(f"{out}: began with another --{', --'.join(other)}; valid with --resume: --{valid}")
+    return own
 
 
 def held_out(opt) -> dict:

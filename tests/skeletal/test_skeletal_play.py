@@ -328,6 +328,11 @@ def test_autoencode_command(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert run(*args, "--resume") == 0 and "steps skeletal" not in capsys.readouterr().out
     assert json.loads((tmp_path / "a.json").read_text()) == first
+    again = ("autoencode", "--resume", "--out", tmp_path / "a")  # the options of the run are its own
+    assert run(*again, "--held", 1, "--json", tmp_path / "b.json") == 0 and "steps plain" not in capsys.readouterr().out
+    assert json.loads((tmp_path / "b.json").read_text())["curves"] == first["curves"]
+    assert run(*again, "--batch", 4) == 0
+    assert run(*again, "--batch", 5) == 2 and "began with another --batch; valid with" in capsys.readouterr().err
 
 
 def test_held_out_without_a_style(monkeypatch):
