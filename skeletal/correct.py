@@ -23,7 +23,7 @@ import mocap.data
 from mocap.data import licences
 from nn import Adam
 from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli
-from plumbing.runs import Progress, check_run, git_state, load_checkpoint, open_run, save_checkpoint, versions
+from plumbing.runs import CONFIG, Progress, git_state, load_checkpoint, open_run, save_checkpoint, versions
 from skeletal import data, rigs
 from skeletal.data import RATE, Motion, Skeleton, Structure
 from skeletal.layers import PLACE, ROOT, fk_forward
@@ -268,7 +268,7 @@ def clips_of(name, opt, k, n):
         cut = int(LAFAN_TRAIN * len(pairs[0][0]))
         return rig, [(m[:cut], c[:cut]) for m, c in pairs]
     folder = {"bandai": "bandai", "cmu": "cmu-inplace"}[name]
-    return rigs.load(name, rigs.files(root / folder, name, "train", opt.limit))
+    return rigs.captured(root, folder, name, "train", opt.limit)
 
 
 def copies_between(sides) -> dict:
@@ -462,10 +462,13 @@ class Correction:
         return self.names.index(name)
 
     def __call__(self, m: Motion, source, target: Skeleton, to, correct=True) -> Motion:
-        """The corrected copy; correct=False: the shifted copy, no network."""
-        A, B, kept = self.sides[source], self.sides[to], self.copies[source, to]
+        """The corrected copy; correct=False: the shifted copy, no network; onto the source's own rig: the plain copy."""
+        start = m.pos[0, :2] * (target.leg / m.skeleton.leg)
         x, turn = data.features(m)
         copy = copy_features(m, target)[0]
+        if source == to:
+            return data.from_features(copy, turn, target, m.name, start)
+        A, B, kept = self.sides[source], self.sides[to], self.copies[source, to]
         base = kept.standardised(copy) if correct else kept.shifted(copy)
         n, pad = len(x), max(-len(x) % 4, 32 - len(x))
         if correct:
@@ -477,7 +480,6 @@ class Correction:
             )
             r, _ = self.nets[to].decode_forward(z, self.nets[to].static_forward(s_b)[0])
             base[:, PLACE:] += r[PLACE:, :n, 0].T
-        start = m.pos[0, :2] * (target.leg / m.skeleton.leg)
         return data.from_features(base * B.std + B.mean, turn, target, m.name, start)
 
 
@@ -495,7 +497,8 @@ def correct(argv) -> int:
     """python -m skeletal correct.  Test: tests/skeletal/test_skeletal_correct.py::test_train_ship_use"""
     opt = cli(CorrectOptions, argv, "python -m skeletal correct", CorrectOptions.__doc__)
     out = Path(opt.out or "runs/correct")
-    check_run(out, False)
+    if (out / CONFIG).exists():
+        raise UserError(f"{out} already holds a run, and this one cannot be continued; valid: another folder")
     sides = gather(opt)
     open_run(out, asdict(opt), False)
     copies = copies_between(sides)

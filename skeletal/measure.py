@@ -58,7 +58,7 @@ def unseen(name, opt) -> list:
         starts = np.linspace(int(LAFAN_TRAIN * len(m)), len(m) - FRAMES, opt.limit).astype(int)
         return rig, [(m[a : a + FRAMES], c[a : a + FRAMES]) for a in starts]
     split, folder = {"bandai": ("validation", "bandai"), "cmu": ("body", "cmu")}[name]
-    rig, pairs = rigs.load(name, rigs.files(root / folder, name, split, opt.limit))
+    rig, pairs = rigs.captured(root, folder, name, split, opt.limit)
     return rig, [(m[:FRAMES], c[:FRAMES]) for m, c in pairs]
 
 

@@ -20,8 +20,9 @@ from pathlib import Path
 import numpy as np
 
 import mocap.data
+from mocap.rigs import FLOORS, HELP, REST_POSES, Reading
 from plumbing import render
-from plumbing.cli import COUNT, POSITIVE, UserError, arg, cli
+from plumbing.cli import COUNT, POSITIVE, UserError, arg, cli, given_flags
 from plumbing.files import atomic_write, check_folders
 from plumbing.runs import latest_checkpoint, load_checkpoint, versions
 from skeletal import correct, data, rigs
@@ -114,8 +115,12 @@ class RetargetOptions:
         None, ".npz of python -m skeletal correct for a rig, else run folder or .npz of python -m skeletal train; "
         "default: the shipped ones", metavar="FILE",
     )  # fmt: skip
-    up: str = arg("y", "axis of the files that points up", choices=("x", "y", "z", "-x", "-y", "-z"))
-    drop: str = arg("", "joints to leave out, as in training")
+    up: str = arg("y", "axis of files of trained rigs that points up", choices=("x", "y", "z", "-x", "-y", "-z"))
+    drop: str = arg("", "joints of files of trained rigs to leave out, as in training")
+    unit: str | None = arg(None, f"of the source, onto a rig: {HELP['unit']}")
+    rate: float | None = arg(None, f"of the source, onto a rig: {HELP['rate']}")
+    floor: str | None = arg(None, f"of the source, onto a rig: {HELP['floor']}", choices=FLOORS)
+    rest_pose: str | None = arg(None, f"of the source, onto a rig: {HELP['rest_pose']}", choices=REST_POSES)
     clean: bool = arg(True, "foot clean-up")
     png: str | None = arg(None, "contact sheet of source and result")
     video: str | None = arg(None, "the same as .mp4")
@@ -129,10 +134,15 @@ def retarget(argv) -> int:
         raise UserError("give --source FILE.bvh, --target FILE.bvh (or B/0), and --out FILE.bvh, --png or --video")
     check_folders(opt.out, opt.png, opt.video, read=(opt.source, opt.target, opt.weights))
     render.check_video(opt.video)
-    family = opt.target[:2] in ("A/", "B/") or len(opt.target.partition("/")[0]) == 1
+    in_file = opt.target.lower().endswith(".bvh")
+    family = not in_file and (opt.target[:2] in ("A/", "B/") or len(opt.target) == 1)
     weights = opt.weights or (SHIPPED if family else correct.SHIPPED)
     if not Path(weights).is_dir() and "rigs" in load_checkpoint(weights)[1]:
+        if not in_file and (odd := given_flags(argv) & {"up", "drop"}):
+            raise UserError(f"--{', --'.join(sorted(odd))} would do nothing: the source is read as mocap reads it")
         return onto_rig(opt, Correction(weights))
+    if odd := given_flags(argv) & {"unit", "rate", "floor", "rest_pose"}:
+        raise UserError(f"--{', --'.join(sorted(odd)).replace('_', '-')}: for a target that is a rig, such as dino")
     net = Retargeter(weights)
     patterns = tuple(p for p in opt.drop.split(",") if p)
     up = lambda k: net.domains[k].structure.up  # noqa: E731
@@ -146,13 +156,13 @@ def retarget(argv) -> int:
 
     source, m = read(opt.source)
     word, _, number = opt.target.partition("/")
-    if word in ("A", "B") and number:
+    if family and word in ("A", "B") and number:
         to = "AB".index(word)
         cast = net.domains[to].characters
         if not number.isdigit() or int(number) >= len(cast):
             raise UserError(f"--target {opt.target}: no such character; valid: {word}/0 to {word}/{len(cast) - 1}")
         target = cast[int(number)]
-    elif word.isalpha() and len(word) == 1 and number.isdigit():
+    elif family:
         raise UserError(f"--target {opt.target}: valid: A or B and the number of a character, as B/3, or a .bvh file")
     else:
         to, other = read(opt.target)
@@ -171,9 +181,9 @@ def finish(opt, m, out, structure, way, label):
     before = data.sliding(out, standing)
     if opt.clean:
         out = data.clean_feet(out, standing)
-    after = data.sliding(out, standing)
-    print(f"{opt.source}: {len(m)} frames, {way}; feet slide {100 * before:.1f} cm/s, "
-          f"after the clean-up {100 * after:.1f}; source {100 * data.sliding(m, standing):.1f}")  # fmt: skip
+    after = f"after the clean-up {100 * data.sliding(out, standing):.1f}" if opt.clean else "not cleaned"
+    print(f"{opt.source}: {len(m)} frames, {way}; feet slide {100 * before:.1f} cm/s, {after}; "
+          f"source {100 * data.sliding(m, standing):.1f}")  # fmt: skip
     if opt.out:
         data.write_motion(opt.out, out, structure)
     if opt.png or opt.video:
@@ -204,7 +214,8 @@ def onto_rig(opt, net: Correction) -> int:
     Test      tests/skeletal/test_skeletal_correct.py::test_retarget_any_human
     """
     to, body = target_body(net, opt.target, opt.up, tuple(p for p in opt.drop.split(",") if p))
-    clip = rigs.at_30(mocap.data.read_clips([opt.source])[0])
+    said = replace(Reading.of(opt), up=None)  # --up is of the target's file
+    clip = rigs.at_30(mocap.data.read_clips([opt.source], said)[0])
     source = net.index("human")
     m = data.to_motion(rigs.human_raw(clip), net.sides[source].rig.structure)
     B = net.sides[to].rig

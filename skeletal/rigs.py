@@ -346,6 +346,13 @@ def in_order(rig: Rig, pairs, first: Skeleton):
     return replace(rig, structure=s, skeleton=body(rig.skeleton), home=home, upright=rig.upright[from_old]), pairs
 
 
+def captured(motion, folder, name, split, limit) -> tuple:
+    """(Rig, pairs) of the captures of a rig in a folder of --motion.  UserError: there are none"""
+    if not (found := files(Path(motion) / folder, name, split, limit)):
+        raise UserError(f"--motion {motion}: no {split} file of {name} in its {folder}/; valid: a folder with {folder}/")
+    return load(name, found)
+
+
 def files(motion, name, split, limit) -> list:
     """Capture files of a folder that have the rig NAME, of one split, evenly chosen."""
     root = Path(motion)

@@ -199,6 +199,26 @@ def test_retarget_any_human(trained, tmp_path, clips, capsys):
         for joint in sdk.ReadFile(str(tmp_path / "b.bvh")).getlistofjoints():
             np.testing.assert_allclose(joint.getPosition(30), pos[30, b.names.index(joint.name)], atol=1e-3)
     assert run("retarget", *files, "--target", "oppy") == 2 and "valid: human, dino" in capsys.readouterr().err
+    for flag, value in (("--up", "z"), ("--drop", "Head")):
+        assert run("retarget", *files, "--target", "dino", flag, value) == 2
+        assert f"{flag} would do nothing" in capsys.readouterr().err
+    assert run("retarget", *files, "--target", "B/none.bvh") == 2 and "character" not in capsys.readouterr().err
+
+
+def test_retarget_onto_the_human(trained, tmp_path, clips, capsys):
+    """The source's own rig needs no network: the plain copy.  What a user says of the file is believed."""
+    jesse = character.load("jesse")
+    write_bvh(tmp_path / "a.bvh", jesse, retarget(jesse, clips[0]).qpos, 30.0, "mixamo")
+    files = ("--weights", trained / "correct-0.npz", "--source", tmp_path / "a.bvh", "--out", tmp_path / "b.bvh")
+    assert run("retarget", *files, "--target", "human", "--no-clean") == 0
+    assert "human -> human" in (said := capsys.readouterr().out) and "not cleaned" in said and "clean-up" not in said
+    net = correct.Correction(trained / "correct-0.npz")
+    m = data.to_motion(rigs.human_raw(captures.read_clips([tmp_path / "a.bvh"])[0]), net.sides[0].rig.structure)
+    got = net(m, 0, net.sides[0].rig.skeleton, 0)
+    turn = np.abs(np.sum(got.quat * m.quat, axis=-1))
+    np.testing.assert_allclose(turn, 1.0, atol=1e-4)  # its rotations are the source's, on the trained bones
+    assert run("retarget", *files, "--target", "human", "--rate", 60) == 0
+    assert f"{(len(m) + 1) // 2} frames" in capsys.readouterr().out
 
 
 def test_retarget_to_a_static_skeleton(trained, tmp_path, clips, capsys):
