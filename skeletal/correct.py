@@ -462,7 +462,7 @@ class Correction:
         return self.names.index(name)
 
     def __call__(self, m: Motion, source, target: Skeleton, to, correct=True) -> Motion:
-        """The corrected copy; correct=False: the shifted copy, no network; onto the source's own rig: the plain copy."""
+        """The corrected copy; correct=False: the shifted copy, no network; onto the source's own rig: the copy."""
         start = m.pos[0, :2] * (target.leg / m.skeleton.leg)
         x, turn = data.features(m)
         copy = copy_features(m, target)[0]

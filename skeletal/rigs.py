@@ -349,7 +349,7 @@ def in_order(rig: Rig, pairs, first: Skeleton):
 def captured(motion, folder, name, split, limit) -> tuple:
     """(Rig, pairs) of the captures of a rig in a folder of --motion.  UserError: there are none"""
     if not (found := files(Path(motion) / folder, name, split, limit)):
-        raise UserError(f"--motion {motion}: no {split} file of {name} in its {folder}/; valid: a folder with {folder}/")
+        raise UserError(f"--motion {motion}: no {split} file of {name} in {folder}/; valid: a folder with {folder}/")
     return load(name, found)
 
 

@@ -117,5 +117,5 @@ def test_bad_rigs(clips):
         rigs.load("wolf", [], clips)
     with pytest.raises(UserError, match="no file of the rig bandai"):
         rigs.load("bandai", [])
-    with pytest.raises(UserError, match="--motion /nowhere: no train file of bandai in its bandai/"):
+    with pytest.raises(UserError, match="--motion /nowhere: no train file of bandai in bandai/"):
         rigs.captured("/nowhere", "bandai", "bandai", "train", 2)
