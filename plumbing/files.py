@@ -88,6 +88,19 @@ def check_folders(*paths, read=()) -> None:
             raise UserError(f"cannot write {out}: it is read-only; give another file")
 
 
+def make_folder(path) -> None:
+    """Before the slow work: make a folder for files to write, unless it is there; None: none is asked for.
+
+    Raises    UserError: it is a file, or cannot be made
+    Test      tests/robustness/test_cli.py::test_make_folder
+    """
+    try:
+        if path:
+            Path(path).mkdir(exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot make the folder {path}: {error.strerror}; give another") from None
+
+
 # ---- files from outside ---------------------------------------------------------------------------------------------
 
 TOML_BYTES, TOML_LINE = 65536, 1000  # tomllib's time and memory grow with the square of the dots in a key

@@ -92,6 +92,7 @@ def git_state(folder=None):
 def check_run(out, resume=False):
     """Is a run there where one is to be resumed, and none where one is to start?  Call it before slow work.
 
+    Args      resume : is one to be continued?  None: of a command that cannot
     Raises    UserError: a run is there already and resume is False, or the folder cannot be made; or none is there and
               resume is True, or its metrics.csv cannot be continued
     Test      tests/plumbing/test_runs.py::test_open_run, tests/robustness/test_fuzz.py::test_run_folders
@@ -99,7 +100,8 @@ def check_run(out, resume=False):
     out = Path(out)
     there = any((out / name).exists() for name in (CONFIG, CHECKPOINT, PREVIOUS, METRICS))
     if there and not resume:
-        raise UserError(f"{out} already holds a run: add --resume to continue it, or choose another folder")
+        go_on = "" if resume is None else "add --resume to continue it, or "
+        raise UserError(f"{out} already holds a run: {go_on}choose another folder")
     if resume and not there:
         raise UserError(f"{out} holds no run to resume: leave out --resume, or name a folder that has {CONFIG}")
     if resume and (out / METRICS).exists():

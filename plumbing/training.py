@@ -53,11 +53,13 @@ def given_names(argv) -> set:
     return {name.removeprefix("no_") for name in given_flags(argv)}
 
 
-def resumed_options(opt, argv):
+def resumed_options(opt, argv, changeable=CHANGEABLE):
     """The stored options of the run in opt.out; the command line may change only what keeps the run the same run.
 
+    Args      changeable : names of options that may differ; the first two are told
     Raises    UserError: a given option differs from the stored one
-    Test      tests/test_ppo.py::test_resume_refuses_other_options
+    Test      tests/test_ppo.py::test_resume_refuses_other_options,
+              tests/skeletal/test_skeletal_play.py::test_autoencode_command
     """
     check_run(opt.out, resume=True)
     stored, given, values = stored_options(type(opt), opt.out), given_names(argv), {}
@@ -65,10 +67,10 @@ def resumed_options(opt, argv):
         asked = getattr(opt, f.name)
         values[f.name] = stored.get(f.name, asked)
         if f.name in given and asked != values[f.name]:
-            if f.name not in CHANGEABLE:
+            if f.name not in changeable:
                 raise UserError(
                     f"{opt.out}: was started with --{f.name} {values[f.name]}; to resume, leave it out "
-                    f"(can change: {', '.join(CHANGEABLE[:2])})"
+                    f"(can change: {', '.join(changeable[:2])})"
                 )
             values[f.name] = asked
     return type(opt)(**values | {"resume": True, "out": opt.out})

@@ -17,9 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from nn import Adam
-from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli, given_flags
+from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli
 from plumbing.files import atomic_write
-from plumbing.runs import Progress, check_run, load_checkpoint, open_run, save_checkpoint, stored_options, versions
+from plumbing.runs import Progress, check_run, load_checkpoint, open_run, save_checkpoint, versions
+from plumbing.training import resumed_options
 from skeletal import data
 from skeletal.layers import PLACE, fk_forward
 from skeletal.layers import fk_backward as fk_grad
@@ -30,6 +31,7 @@ NOISES = ("clean", "gaussian", "zeros")
 EPS = 0.02  # ASSUMED: of the identity, added to every quaternion, so that a zeroed one has a direction to begin with
 CLIP = 1.0  # ASSUMED: longest gradient
 KINDS = ("skeletal", "plain")
+AGAIN = ("held", "seeds", "json", "resume", "out")  # may differ when a run is measured again or gets more seeds
 PLAIN = (7, 16)  # channels of the plain one: within 3 % of the skeletal one's weights on Bandai's rig, instead of 10 %
 
 
@@ -82,7 +84,7 @@ def autoencode(argv) -> int:
     out = Path(opt.out or "runs/autoencode")
     check_run(out, opt.resume)
     if opt.resume:
-        opt = resumed(opt, argv, out)
+        opt = resumed_options(replace(opt, out=str(out)), argv, AGAIN)
     structure, motions = base_motions(opt, "train", opt.limit)
     skeleton = motions[0].skeleton
     domain = Domain([skeleton], [(0, replace(m, skeleton=skeleton)) for m in motions], structure=structure)
@@ -121,22 +123,6 @@ def autoencode(argv) -> int:
         table |= {"curves": curves, "versions": versions()}
         atomic_write(opt.json, json.dumps(table, indent=2) + "\n")
     return 0
-
-
-AGAIN = {"resume", "out", "json", "held", "seeds"}  # what may differ when a run is measured again or gets more seeds
-
-
-def resumed(opt, argv, out) -> AutoOptions:
-    """The run's own options, with those of AGAIN that are given now.
-
-    Raises    UserError: another flag is given, with another value
-    Test      tests/skeletal/test_skeletal_play.py::test_autoencode_command"""
-    given = {name: getattr(opt, name) for name in given_flags(argv)}
-    own = replace(AutoOptions(**stored_options(AutoOptions, out)), **{k: v for k, v in given.items() if k in AGAIN})
-    if other := sorted(k for k, v in given.items() if v != getattr(own, k)):
-        valid = ", --".join(sorted(AGAIN))
-        raise UserError(f"{out}: began with another --{', --'.join(other)}; valid with --resume: --{valid}")
-    return own
 
 
 def held_out(opt) -> dict:

@@ -23,7 +23,7 @@ import mocap.data
 from mocap.data import licences
 from nn import Adam
 from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli
-from plumbing.runs import CONFIG, Progress, git_state, load_checkpoint, open_run, save_checkpoint, versions
+from plumbing.runs import Progress, check_run, git_state, load_checkpoint, open_run, save_checkpoint, versions
 from skeletal import data, rigs
 from skeletal.data import RATE, Motion, Skeleton, Structure
 from skeletal.layers import PLACE, ROOT, fk_forward
@@ -497,10 +497,9 @@ def correct(argv) -> int:
     """python -m skeletal correct.  Test: tests/skeletal/test_skeletal_correct.py::test_train_ship_use"""
     opt = cli(CorrectOptions, argv, "python -m skeletal correct", CorrectOptions.__doc__)
     out = Path(opt.out or "runs/correct")
-    if (out / CONFIG).exists():
-        raise UserError(f"{out} already holds a run, and this one cannot be continued; valid: another folder")
+    check_run(out, None)
     sides = gather(opt)
-    open_run(out, asdict(opt), False)
+    open_run(out, asdict(opt), None)
     copies = copies_between(sides)
     for s in sides:
         print(f"{s.rig.name}: {len(s.names)} joints, {len(s.bodies)} bodies, {len(s.windows)} windows")

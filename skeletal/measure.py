@@ -16,7 +16,7 @@ import numpy as np
 
 import mocap.data
 from plumbing.cli import COUNT, POSITIVE, UserError, arg, cli
-from plumbing.files import atomic_write, check_folders
+from plumbing.files import atomic_write, check_folders, make_folder
 from plumbing.runs import versions
 from skeletal import data, rigs
 from skeletal.correct import LAFAN_TRAIN, SHIPPED, Correction, bases_of, limbs
@@ -141,7 +141,6 @@ def sheets(net: Correction, found, opt):
     """One contact sheet a pair: the source, and the result after the clean-up over the truth.
 
     Raises    UserError: no OpenGL"""
-    Path(opt.png).mkdir(exist_ok=True)
     drawn = set()
     for name, source, m, target, true in found:
         if name not in drawn:
@@ -179,6 +178,7 @@ def measure(argv) -> int:
     """python -m skeletal measure.  Test: tests/skeletal/test_skeletal_correct.py::test_measure"""
     opt = cli(MeasureOptions, argv, "python -m skeletal measure", MeasureOptions.__doc__)
     check_folders(opt.json, opt.png)
+    make_folder(opt.png)
     nets = [Correction(p) for p in opt.weights.split(",")]
     if any(n.names != nets[0].names for n in nets):
         raise UserError(f"--weights {opt.weights}: trained on different rigs; valid: seeds of one training")

@@ -23,7 +23,7 @@ import mocap.data
 from mocap.rigs import FLOORS, HELP, REST_POSES, Reading
 from plumbing import render
 from plumbing.cli import COUNT, POSITIVE, UserError, arg, cli, given_flags
-from plumbing.files import atomic_write, check_folders
+from plumbing.files import atomic_write, check_folders, make_folder
 from plumbing.runs import latest_checkpoint, load_checkpoint, versions
 from skeletal import correct, data, rigs
 from skeletal.autoencode import autoencode
@@ -134,8 +134,8 @@ def retarget(argv) -> int:
         raise UserError("give --source FILE.bvh, --target FILE.bvh (or B/0), and --out FILE.bvh, --png or --video")
     check_folders(opt.out, opt.png, opt.video, read=(opt.source, opt.target, opt.weights))
     render.check_video(opt.video)
-    in_file = opt.target.lower().endswith(".bvh")
-    family = not in_file and (opt.target[:2] in ("A/", "B/") or len(opt.target) == 1)
+    in_file, (word, _, number) = opt.target.lower().endswith(".bvh"), opt.target.partition("/")
+    family = len(word) == 1 and not in_file
     weights = opt.weights or (SHIPPED if family else correct.SHIPPED)
     if not Path(weights).is_dir() and "rigs" in load_checkpoint(weights)[1]:
         if not in_file and (odd := given_flags(argv) & {"up", "drop"}):
@@ -155,7 +155,6 @@ def retarget(argv) -> int:
         return k, data.to_motion(raw, net.domains[k].structure)
 
     source, m = read(opt.source)
-    word, _, number = opt.target.partition("/")
     if family and word in ("A", "B") and number:
         to = "AB".index(word)
         cast = net.domains[to].characters
@@ -254,6 +253,7 @@ def families(argv) -> int:
     """python -m skeletal families: errors x 1000.  Test: tests/skeletal/test_skeletal_play.py::test_measure_command"""
     opt = cli(FamilyOptions, argv, "python -m skeletal families", FamilyOptions.__doc__)
     check_folders(opt.json, opt.png)
+    make_folder(opt.png)
     nets = {name: Retargeter(name) for name in opt.weights.split(",")}
     cases = held_out(opt, next(iter(nets.values())))
     results = {"copies": copies(cases), "shifted": shifted(cases, next(iter(nets.values())))}
@@ -347,7 +347,6 @@ def sheets(cases, net, opt):
 
     Raises    UserError: no OpenGL
     Test      tests/skeletal/test_skeletal_play.py::test_sheets"""
-    Path(opt.png).mkdir(exist_ok=True)
     cross = [c for c in cases if c[0] == "cross"]
     for i in np.unique(np.linspace(0, len(cross) - 1, opt.sheets).astype(int)):
         _, a, m, b, true = cross[i]

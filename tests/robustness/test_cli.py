@@ -27,7 +27,8 @@ from mocap import __main__ as mocap_command
 from mocap import bvh
 from mocap.data import load
 from plumbing import render
-from plumbing.cli import run_main
+from plumbing.cli import UserError, run_main
+from plumbing.files import make_folder
 from plumbing.runs import CHECKPOINT, CONFIG, METRICS, load_checkpoint, read_metrics, save_checkpoint
 from policy import Policy, load_policy
 
@@ -197,6 +198,18 @@ def test_pipes_and_devices(what, here, capsys):
     assert err.count("\n") == 1
     kind = "device" if what == "/dev/zero" else "pipe"
     assert re.search(rf"{names.get(what, 'f.bvh' if what == '.' else what)}: is a {kind}; expected ", err), err
+
+
+def test_make_folder(tmp_path):
+    make_folder(None)
+    for _ in range(2):  # one that is there is kept
+        make_folder(tmp_path / "a")
+        assert (tmp_path / "a").is_dir()
+    (tmp_path / "b").write_text("mine")
+    for path in (tmp_path / "b", tmp_path / "b" / "c", tmp_path / "none" / "d"):
+        with pytest.raises(UserError, match=f"cannot make the folder {path}"):
+            make_folder(path)
+    assert (tmp_path / "b").read_text() == "mine" and not (tmp_path / "none").exists()
 
 
 def test_folder_to_write(here, capsys):
