@@ -68,9 +68,10 @@ class Side:
     """One rig in training: bodies, statistics, clips.
 
     anchor : (E, 3) limbs when the canonical human stands upright, less a human's: 0 for people, a bent-over Dino's not
+    stand  : (F,) `skeletal.data.stand_heights` of its clips, the median
     """
 
-    def __init__(self, rig: rigs.Rig, bodies, clips=(), stats=None, anchor=None):
+    def __init__(self, rig: rigs.Rig, bodies, clips=(), stats=None, anchor=None, stand=None):
         self.rig, self.bodies, self.clips = rig, list(bodies), list(clips)
         s = rig.skeleton
         self.parents, self.names, self.ends = np.array(s.parents), s.names, s.graph.leaves
@@ -81,6 +82,8 @@ class Side:
         self.x, self.turn = [x for x, _ in seen], [t for _, t in seen]
         self.mean, self.std = stats if stats is not None else statistics(self.x)
         self.standing = [data.contacts(m) for _, m in self.clips]
+        heights = [data.stand_heights(m, s) for (_, m), s in zip(self.clips, self.standing)]
+        self.stand = np.median(heights, axis=0) if stand is None else stand
         self.static = [(k.offsets / k.leg).astype(np.float32) for k in self.bodies]
         self.lengths = [self.limb_lengths(k) for k in self.bodies]
         self.reach = [(k.reach() / k.leg).astype(np.float32) for k in self.bodies]
@@ -408,8 +411,9 @@ def arrays_of(nets, sides, copies) -> dict:
     for k, (net, s) in enumerate(zip(nets, sides)):
         r = s.rig
         out |= {f"generator{k}": net.theta, f"mean{k}": s.mean, f"std{k}": s.std, f"anchor{k}": s.anchor,
-                f"offsets{k}": np.stack([b.offsets for b in s.bodies]), f"reference{k}": r.structure.reference,
-                f"upright{k}": r.upright, f"home{k}": np.array(r.home, float)}  # fmt: skip
+                f"stand{k}": s.stand, f"offsets{k}": np.stack([b.offsets for b in s.bodies]),
+                f"reference{k}": r.structure.reference, f"upright{k}": r.upright,
+                f"home{k}": np.array(r.home, float)}  # fmt: skip
     for (m, n), c in copies.items():
         out |= {f"copy_mean{m}-{n}": c.mean, f"copy_std{m}-{n}": c.std}
     return out
@@ -482,6 +486,18 @@ class Correction:
             base[:, PLACE:] += r[PLACE:, :n, 0].T
         return data.from_features(base * B.std + B.mean, turn, target, m.name, start)
 
+    def clean(self, out: Motion, m: Motion, source, to) -> Motion:
+        r"""The foot clean-up of a result, its feet on the target's floor.
+
+        Equation  a foot that stands is as high as the rig's stand in its own clips, and as much above that as the
+                  source's foot above its own: h_B = l_B (stand_B + h_A / l_A - stand_A), l the legs
+        Args      m : the source
+        Test      tests/skeletal/test_skeletal_correct.py::test_results_stand_on_the_floor
+        """
+        standing = data.contacts(m)
+        z = data.pose(m)[0][:, list(m.skeleton.feet), 2] / m.skeleton.leg - data.stand_heights(m, standing)
+        return data.clean_feet(out, standing, out.skeleton.leg * (self.sides[to].stand + z))
+
 
 def side_from(arrays, d, k) -> Side:
     """One rig of a checkpoint."""
@@ -490,7 +506,8 @@ def side_from(arrays, d, k) -> Side:
     bodies = [Skeleton(names, parents, o, feet) for o in arrays[f"offsets{k}"]]
     home = tuple((int(a), int(b), float(w)) for a, b, w in arrays[f"home{k}"])
     rig = rigs.Rig(d["rig"], s, bodies[0], home, arrays[f"upright{k}"], d["segments"], rigs.character_of(d["rig"]))
-    return Side(rig, bodies, stats=(arrays[f"mean{k}"], arrays[f"std{k}"]), anchor=arrays[f"anchor{k}"])
+    stats = arrays[f"mean{k}"], arrays[f"std{k}"]
+    return Side(rig, bodies, stats=stats, anchor=arrays[f"anchor{k}"], stand=arrays[f"stand{k}"])
 
 
 def correct(argv) -> int:

@@ -688,15 +688,27 @@ def contacts(m: Motion) -> np.ndarray:
     return out
 
 
-def clean_feet(m: Motion, standing) -> Motion:
+def stand_heights(m: Motion, standing) -> np.ndarray:
+    """(F,) how high a foot's end is while it stands, in legs: the median; the lowest of one that never stands.
+
+    Test      tests/skeletal/test_skeletal_data.py::test_stand_heights"""
+    z = pose(m)[0][:, list(m.skeleton.feet), 2] / m.skeleton.leg
+    return np.array([np.median(h[s]) if s.any() else h.min() for h, s in zip(z.T, standing.T)])
+
+
+def clean_feet(m: Motion, standing, heights=None) -> Motion:
     r"""Foot clean-up  [SAN §5.2]: while a foot stands, it stays at the mean of its places; blended in and out over +- 5
     frames with a smooth step; by damped least squares on the leg; the foot keeps its orientation.  A leg that ends at
     the ankle is solved for its end.
 
-    Args      standing : (T, F) contacts of the input motion
-    Test      tests/skeletal/test_skeletal_data.py::test_foot_cleanup
+    Args      standing : (T, F) contacts of the input motion; heights : (T, F) [m], where its feet's ends should be:
+              the body is shifted so that those that stand are there in the median, and each is brought there.  ASSUMED
+    Test      tests/skeletal/test_skeletal_data.py::test_foot_cleanup, test_feet_come_to_the_floor
     """
     out = m
+    if heights is not None and standing.any():
+        off = heights - pose(m)[0][:, list(m.skeleton.feet), 2]
+        out = replace(m, pos=m.pos + [0.0, 0.0, np.median(off[standing])])
     for i, f in enumerate(m.skeleton.feet):
         chain = _limb(m.skeleton, f)
         if len(chain) < 3:
@@ -707,6 +719,8 @@ def clean_feet(m: Motion, standing) -> Motion:
         edges = np.flatnonzero(np.diff(np.concatenate([[0], standing[:, i].astype(int), [0]])))
         for a, b in edges.reshape(-1, 2):
             goal = p[a:b, f].mean(axis=0)
+            if heights is not None:
+                goal[2] = heights[a:b, i].mean()
             for t in range(max(a - BLEND, 0), min(b + BLEND, len(m))):
                 away = max(a - t, t - b + 1, 0) / (BLEND + 1)
                 w = 1 - away * away * (3 - 2 * away)

@@ -24,11 +24,11 @@ from skeletal.data import RATE, Motion
 from skeletal.pictures import draw
 
 ROWS = ("network", "network_clean", "shifted_copy", "copy", "ik", "mean_pose", "truth")
-METRICS = ("joint", "ee", "slide_cm_s")
+METRICS = ("joint", "ee", "slide_cm_s", "float_cm")
 FRAMES = 150  # of a clip, at most
 LEGEND = """joint: ((p - p_true) / height)^2 x 1000, relative to the root; ee: distance of the ends of arms, legs and
 head from the truth's, relative to the root, in lengths of the limb; slide_cm_s: mean speed of the feet that stand in
-the source.  Three figures a row: joint, ee, slide_cm_s"""
+the source; float_cm: how far above or below the truth's their ends are.  Four figures a row, in this order"""
 
 
 @dataclass
@@ -102,9 +102,19 @@ def end_error(m: Motion, true: Motion, mask) -> float:
     return float(np.mean(np.linalg.norm(d, axis=-1) / length))
 
 
+def floating(m: Motion, true: Motion, standing) -> float:
+    """Mean distance in height of the feet's ends from the truth's, while they stand in the source [m].
+
+    Test      tests/skeletal/test_skeletal_correct.py::test_results_stand_on_the_floor"""
+    feet = list(m.skeleton.feet)
+    d = data.pose(m)[0][:, feet, 2] - data.pose(true)[0][:, feet, 2]
+    return float(np.abs(d[standing]).mean()) if standing.any() else 0.0
+
+
 def row(m: Motion, true: Motion, standing, mask) -> dict:
-    """The three metrics of one result."""
-    values = (1e3 * data.error(m, true, root=False), end_error(m, true, mask), 100 * data.sliding(m, standing))
+    """The four metrics of one result."""
+    values = (1e3 * data.error(m, true, root=False), end_error(m, true, mask),
+              100 * data.sliding(m, standing), 100 * floating(m, true, standing))  # fmt: skip
     return dict(zip(METRICS, values))
 
 
@@ -129,7 +139,7 @@ def network_rows(net: Correction, case) -> dict:
     standing, mask = data.contacts(m), limbs(B.names, B.rig.skeleton, bases_of(B.rig))
     got = net(m, source, true.skeleton, target)
     return {"network": row(got, true, standing, mask),
-            "network_clean": row(data.clean_feet(got, standing), true, standing, mask)}  # fmt: skip
+            "network_clean": row(net.clean(got, m, source, target), true, standing, mask)}  # fmt: skip
 
 
 def averaged(rows) -> dict:
@@ -145,8 +155,8 @@ def sheets(net: Correction, found, opt):
     for name, source, m, target, true in found:
         if name not in drawn:
             drawn.add(name)
-            got = data.clean_feet(net(m, source, true.skeleton, target), data.contacts(m))
-            path, labels = Path(opt.png) / f"{name}.png", ["source", "network", "truth"]
+            got = net.clean(net(m, source, true.skeleton, target), m, source, target)
+            path, labels = Path(opt.png) / f"{name}.png", ["source", "network, cleaned", "truth"]
             draw([m, got, true], labels, path, None, opt.every, (0, 1, 1))
 
 
@@ -185,10 +195,10 @@ def measure(argv) -> int:
     found = cases(nets[0], opt)
     result = table(nets, found)
     result |= summary(result["pairs"])
-    head = f"{'':22s}" + "".join(f"{r:>26s}" for r in ROWS)
+    head = f"{'':22s}" + "".join(f"{r:>32s}" for r in ROWS)
     print(head)
     for name, rows in (*result["pairs"].items(), ("mean", result["mean"])):
-        print(f"{name:22s}" + "".join("{:10.2f}{:8.3f}{:8.1f}".format(*rows[r].values()) for r in ROWS))
+        print(f"{name:22s}" + "".join("{:10.2f}{:8.3f}{:8.1f}{:6.1f}".format(*rows[r].values()) for r in ROWS))
     ahead, of = result["ahead"], result["of"]
     gain = ", ".join(f"{k} {100 * v:.0f} % ({ahead[k]} of {of} pairs)" for k, v in result["gain"].items())
     print(f"network below the shifted copy by {gain}")
@@ -198,5 +208,3 @@ def measure(argv) -> int:
     if opt.json:
         atomic_write(opt.json, json.dumps(result | {"versions": versions()}, indent=2) + "\n")
     return 0
-
-

@@ -171,15 +171,16 @@ def retarget(argv) -> int:
     return 0
 
 
-def finish(opt, m, out, structure, way, label):
+def finish(opt, m, out, structure, way, label, clean=data.clean_feet):
     """Clean the feet if asked to, say how far they slide, and write and draw what is wanted.
 
-    Args      m, out : source and result; structure : to write it with; way : from what to what; label : in pictures
+    Args      m, out : source and result; structure : to write it with; way : from what to what; label : in pictures;
+              clean : function of (result, contacts of the source)
     Test      tests/skeletal/test_skeletal_play.py::test_retarget_command"""
     standing = data.contacts(m)
     before = data.sliding(out, standing)
     if opt.clean:
-        out = data.clean_feet(out, standing)
+        out = clean(out, standing)
     after = f"after the clean-up {100 * data.sliding(out, standing):.1f}" if opt.clean else "not cleaned"
     print(f"{opt.source}: {len(m)} frames, {way}; feet slide {100 * before:.1f} cm/s, {after}; "
           f"source {100 * data.sliding(m, standing):.1f}")  # fmt: skip
@@ -219,7 +220,8 @@ def onto_rig(opt, net: Correction) -> int:
     m = data.to_motion(rigs.human_raw(clip), net.sides[source].rig.structure)
     B = net.sides[to].rig
     in_file = replace(B.structure, up="y", unit=0.01)
-    finish(opt, m, net(m, source, body, to), in_file, f"human -> {B.name}", B.name)
+    clean = lambda out, _: net.clean(out, m, source, to)  # noqa: E731
+    finish(opt, m, net(m, source, body, to), in_file, f"human -> {B.name}", B.name, clean)
     return 0
 
 

@@ -183,6 +183,27 @@ def test_train_ship_use(trained, sides, clips, tmp_path):
     assert run("correct", "--rigs", "human,dino", "--steps", 2, "--out", trained) == 2
 
 
+def test_results_stand_on_the_floor(trained, sides):
+    """Cleaned, standing feet are as high as the target's stand in its own clips, and as much above that as the
+    source's; not cleaned, they are not."""
+    net = correct.Correction(trained / "correct-0.npz")
+    np.testing.assert_array_equal(net.sides[1].stand, sides[1].stand)
+    heights = np.array([data.stand_heights(m, data.contacts(m)) for _, m in sides[1].clips])
+    middle = [(len(heights) - 1) // 2, len(heights) // 2]
+    np.testing.assert_allclose(sides[1].stand, np.sort(heights, axis=0)[middle].mean(axis=0))
+    m = sides[0].clips[0][1]
+    standing, body = data.contacts(m), net.sides[1].rig.skeleton
+    got = net(m, 0, body, 1)
+    got = replace(got, pos=got.pos + [0.0, 0.0, 0.1])  # a result that floats
+    z = data.pose(m)[0][:, list(m.skeleton.feet), 2] / m.skeleton.leg
+    wanted = body.leg * (net.sides[1].stand + z - data.stand_heights(m, standing))
+    off = lambda r: np.abs(data.pose(r)[0][:, list(body.feet), 2] - wanted)[standing].mean()  # noqa: E731
+    assert off(net.clean(got, m, 0, 1)) < 0.02 and off(got) > 0.05
+    low = replace(got, pos=got.pos - [0.0, 0.0, 0.03])
+    assert measure.floating(low, got, standing) == pytest.approx(0.03)
+    assert measure.floating(low, got, np.zeros_like(standing)) == 0.0
+
+
 def test_retarget_any_human(trained, tmp_path, clips, capsys):
     """A Mixamo-like file of a character goes in by its canonical human, Dino's joints come out, y up in centimetres."""
     jesse = character.load("jesse")

@@ -229,6 +229,33 @@ def test_foot_cleanup():
     assert data.sliding(m, nobody) == 0.0
 
 
+def test_stand_heights():
+    """Counted frame by frame; a foot that never stands has its lowest."""
+    m = data.human_motion(motion.load("builtin", clips="walk_005")[0])[:90]
+    standing = data.contacts(m)
+    standing[:, 1] = False
+    p = data.pose(m)[0]
+    left = sorted(p[t, m.skeleton.feet[0], 2] / m.skeleton.leg for t in range(90) if standing[t, 0])
+    got = data.stand_heights(m, standing)
+    assert abs(got[0] - left[len(left) // 2]) <= max(np.diff(left)) and 0.0 < got[0] < 0.1
+    assert got[1] == pytest.approx(p[:, m.skeleton.feet[1], 2].min() / m.skeleton.leg)
+
+
+def test_feet_come_to_the_floor():
+    """A body that floats by 9 cm comes down, and each standing foot is where it should be; who never stands is left."""
+    m = data.human_motion(motion.load("builtin", clips="walk_005")[0])[:90]
+    standing, feet = data.contacts(m), list(m.skeleton.feet)
+    wanted = data.pose(m)[0][:, feet, 2]
+    high = replace(m, pos=m.pos + [0.0, 0.0, 0.09])
+    clean = data.clean_feet(high, standing, wanted)
+    np.testing.assert_allclose(clean.pos[:, 2], m.pos[:, 2], atol=1e-9)
+    off = (data.pose(clean)[0][:, feet, 2] - wanted)[standing]
+    plain = (data.pose(data.clean_feet(high, standing))[0][:, feet, 2] - wanted)[standing]
+    assert np.abs(off).mean() < 0.01 and np.abs(plain).mean() > 0.08
+    nobody = np.zeros_like(standing)
+    np.testing.assert_array_equal(data.clean_feet(high, nobody, wanted).pos, high.pos)
+
+
 def test_foot_cleanup_without_toes():
     """A leg of thigh, shin and ankle alone: both of its joints help, and the ankle stays where it stood."""
     m = data.human_motion(motion.load("builtin", clips="walk_005")[0])[:90]
