@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -43,10 +43,12 @@ from plumbing.runs import (
     stored_options,
     versions,
 )
+from plumbing.training import resumed_options
 
 NORM_LIMIT = 5e3  # of a gradient: far above a usual one, so that only accidents are cut
 SIZES = ("latent", "hidden", "pose_latent", "pose_hidden")
 COUNT_SHOWN = 25  # rollouts a printed line
+AGAIN = ("updates", "checkpoint_minutes", "resume", "out")  # may differ when a run goes on
 
 
 @dataclass
@@ -679,8 +681,7 @@ def main(argv=None):
             f"python -m drop needs a command{'' if name is None else f', not {name!r}'}; valid: {', '.join(COMMANDS)}"
         )
     if opt.resume:
-        longer = {} if opt.updates == Options.updates else {"updates": opt.updates}  # --updates moves the run's end
-        opt = replace(opt, **(stored_options(Options, opt.out) | longer | {"out": opt.out, "resume": True}))
+        opt = resumed_options(opt, argv, AGAIN)
     found = COMMANDS[name](opt)
     if name == "ship":
         print(f"{opt.weights}: {found['updates']} updates, bound {found['bound']:.2f}; {found['licence']}")

@@ -58,8 +58,8 @@ def resumed_options(opt, argv, changeable=CHANGEABLE):
 
     Args      changeable : names of options that may differ; the first two are told
     Raises    UserError: a given option differs from the stored one
-    Test      tests/test_ppo.py::test_resume_refuses_other_options,
-              tests/skeletal/test_skeletal_play.py::test_autoencode_command
+    Test      tests/test_ppo.py::test_resume_refuses_other_options, tests/drop/test_drop_vae.py::test_command,
+              tests/skeletal/test_skeletal_play.py::test_autoencode_command, test_train_command
     """
     check_run(opt.out, resume=True)
     stored, given, values = stored_options(type(opt), opt.out), given_names(argv), {}

@@ -16,7 +16,7 @@ import numpy as np
 import mocap.data
 from mocap.data import licences
 from nn import Adam
-from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli, given_flags
+from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli
 from plumbing.runs import (
     CHECKPOINT,
     Journal,
@@ -29,9 +29,9 @@ from plumbing.runs import (
     rng_from_state,
     rng_state,
     save_checkpoint,
-    stored_options,
     versions,
 )
+from plumbing.training import resumed_options
 from skeletal.data import (
     Motion,
     Skeleton,
@@ -220,6 +220,9 @@ def reorder_motion(m: Motion, s: Structure, order) -> Motion:
 
 
 # ------------------------------------------------------------------------------------ training
+
+
+AGAIN = ("steps", "lr", "save_minutes", "resume", "out")  # may differ when a run goes on
 
 
 @dataclass
@@ -484,11 +487,10 @@ def train(argv) -> int:
         print(f"{opt.ship}: {meta['steps']} steps; {meta['licence']}")
         return 0
     check_run(out, opt.resume)
+    if opt.resume:
+        opt = resumed_options(replace(opt, out=str(out)), argv, AGAIN)
     if (opt.a is None) != (opt.b is None):
         raise UserError("--a and --b go together: two folders of two rigs; or give --motion alone")
-    if opt.resume:
-        given = {k: getattr(opt, k) for k in given_flags(argv) & {"lr", "steps", "save_minutes"}}
-        opt = replace(TrainOptions(**stored_options(TrainOptions, out)), out=str(out), resume=True, **given)
     domains, origin = prepared(opt), origins(opt)
     for name, d in zip("AB", domains):
         print(f"{name}: {len(d.names)} joints, {len(d.characters)} characters, {len(d.windows)} windows")

@@ -591,6 +591,10 @@ def test_command(tmp_path, monkeypatch, capsys):
     small = [w for k, v in TINY.items() for w in (f"--{k}", v)]
     code, out = run("train", "--out", tmp_path / "a", *small)
     assert code == 0 and "100.0%" in out.out
+    code, out = run("train", "--resume", "--out", tmp_path / "a", "--hidden", 999)
+    assert code == 2 and f"was started with --hidden {TINY['hidden']}; to resume, leave it out" in out.err
+    code, out = run("train", "--resume", "--out", tmp_path / "a", "--updates", TINY["updates"] + 1)
+    assert code == 0 and f"{TINY['updates'] + 1}" in out.out
     code, out = run("ship", "--out", tmp_path / "a", "--weights", tmp_path / "w.npz")
     assert code == 0 and "MIT" in out.out
     code, out = run("evaluate", "--weights", tmp_path / "w.npz")

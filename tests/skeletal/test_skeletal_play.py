@@ -64,6 +64,8 @@ def test_train_command(trained, capsys, tmp_path):
     assert x.shape == (7 + 4 * 16, train.WINDOW, 3) and x.dtype == np.float32
     assert run("train", "--resume", "--out", out, "--steps", 3) == 0
     assert load_checkpoint(out / CHECKPOINT)[1]["steps"] == 3 and "3/3 steps" in capsys.readouterr().out
+    assert run("train", "--resume", "--out", out, "--batch", 9) == 2
+    assert "was started with --batch 2; to resume, leave it out" in capsys.readouterr().err
     assert run("train", "--out", out) == 2 and "add --resume" in capsys.readouterr().err
     assert run("train", "--a", tmp_path, "--out", tmp_path / "x") == 2 and "--a and --b" in capsys.readouterr().err
     assert run("train", "--steps", 0) == 2 and not (tmp_path / "x").exists()
