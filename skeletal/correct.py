@@ -23,6 +23,7 @@ import mocap.data
 from mocap.data import licences
 from nn import Adam
 from plumbing.cli import COUNT, NONNEGATIVE, POSITIVE, UserError, arg, cli
+from plumbing.files import check_folders
 from plumbing.runs import Progress, check_run, git_state, load_checkpoint, open_run, save_checkpoint, versions
 from skeletal import data, rigs
 from skeletal.data import RATE, Motion, Skeleton, Structure
@@ -219,11 +220,11 @@ def gather(opt) -> list:
     Raises    UserError: an unknown rig, or captures that are not there
     Test      tests/skeletal/test_skeletal_correct.py::test_gather_is_unpaired
     """
-    names = [n for n in opt.rigs.split(",") if n]
+    names = [n.strip() for n in opt.rigs.split(",") if n.strip()]
     if bad := [n for n in names if n not in rigs.RIGS]:
         raise UserError(f"--rigs {bad[0]}: no such rig; valid: {', '.join(rigs.RIGS)}")
-    if len(names) < 2:
-        raise UserError(f"--rigs {opt.rigs}: one rig; valid: two or more of {', '.join(rigs.RIGS)}")
+    if len(names) < 2 or len(set(names)) < len(names):
+        raise UserError(f"--rigs {opt.rigs}: one rig, or one twice; valid: two or more of {', '.join(rigs.RIGS)}")
     found, first = [], None
     for k, name in enumerate(names):
         rig, pairs = clips_of(name, opt, k, len(names))
@@ -439,13 +440,17 @@ class Correction:
     """
 
     def __init__(self, path):
-        arrays, self.meta = load_checkpoint(path, finite=("generator*",))
+        arrays, self.meta = load_checkpoint(path, finite=("generator*", "*"))
         if "rigs" not in self.meta:
             raise UserError(f"{path}: not of python -m skeletal correct; valid: its .npz")
+        if "stand0" not in arrays:
+            raise UserError(f"{path}: has no standing heights, as older files; valid: trained anew")
         try:
             self.sides = [side_from(arrays, d, k) for k, d in enumerate(self.meta["rigs"])]
             self.nets = [generator(s, 0) for s in self.sides]
             for k, net in enumerate(self.nets):
+                if arrays[f"generator{k}"].shape != net.theta.shape:
+                    raise ValueError(f"generator{k} has {arrays[f'generator{k}'].size} numbers, not {net.theta.size}")
                 net.theta[:] = arrays[f"generator{k}"]
             n = range(len(self.sides))
             self.copies = {(a, b): Copies(self.sides[a], self.sides[b],
@@ -487,16 +492,18 @@ class Correction:
         return data.from_features(base * B.std + B.mean, turn, target, m.name, start)
 
     def clean(self, out: Motion, m: Motion, source, to) -> Motion:
-        r"""The foot clean-up of a result, its feet on the target's floor.
+        r"""The foot clean-up of a result; feet that stand are as high as the target rig's do in its own clips.
 
-        Equation  a foot that stands is as high as the rig's stand in its own clips, and as much above that as the
-                  source's foot above its own: h_B = l_B (stand_B + h_A / l_A - stand_A), l the legs
+        Equation  h_B = l_B (stand_B + h_A / l_A - stand_A - g),  g = min_f (stand heights of m - stand_A)
+        Symbols   h (T, F) height of a foot's end; l the legs; stand `Side.stand`; g how far the source's floor is from
+                  where its rig has it, told by its lower foot: a foot that is held up stays up
         Args      m : the source
         Test      tests/skeletal/test_skeletal_correct.py::test_results_stand_on_the_floor
         """
-        standing = data.contacts(m)
-        z = data.pose(m)[0][:, list(m.skeleton.feet), 2] / m.skeleton.leg - data.stand_heights(m, standing)
-        return data.clean_feet(out, standing, out.skeleton.leg * (self.sides[to].stand + z))
+        standing, stand = data.contacts(m), self.sides[source].stand
+        floor = np.min(data.stand_heights(m, standing) - stand)
+        above = data.pose(m)[0][:, list(m.skeleton.feet), 2] / m.skeleton.leg - stand - floor
+        return data.clean_feet(out, standing, out.skeleton.leg * (self.sides[to].stand + above))
 
 
 def side_from(arrays, d, k) -> Side:
@@ -507,6 +514,8 @@ def side_from(arrays, d, k) -> Side:
     home = tuple((int(a), int(b), float(w)) for a, b, w in arrays[f"home{k}"])
     rig = rigs.Rig(d["rig"], s, bodies[0], home, arrays[f"upright{k}"], d["segments"], rigs.character_of(d["rig"]))
     stats = arrays[f"mean{k}"], arrays[f"std{k}"]
+    if arrays[f"stand{k}"].shape != (len(feet),):
+        raise ValueError(f"stand{k} has not {len(feet)} numbers")
     return Side(rig, bodies, stats=stats, anchor=arrays[f"anchor{k}"], stand=arrays[f"stand{k}"])
 
 
@@ -515,6 +524,7 @@ def correct(argv) -> int:
     opt = cli(CorrectOptions, argv, "python -m skeletal correct", CorrectOptions.__doc__)
     out = Path(opt.out or "runs/correct")
     check_run(out, None)
+    check_folders(opt.ship)
     sides = gather(opt)
     open_run(out, asdict(opt), None)
     copies = copies_between(sides)
@@ -537,7 +547,9 @@ def ship(run, path):
 
 
 def train(opt, trainer, path, seed):
-    """Steps of one seed, with a checkpoint and a line every hundred."""
+    """Steps of one seed, with a checkpoint and a line every fifty, and a checkpoint at the end.
+
+    Test      tests/skeletal/test_skeletal_correct.py::test_minutes"""
     progress, recent, curve, start = Progress(opt.steps, 0, f"steps of seed {seed}"), [], [], time.process_time()
     while trainer.step_count < opt.steps and time.process_time() - start < 60 * opt.minutes:
         for adam in trainer.adams:
@@ -550,6 +562,7 @@ def train(opt, trainer, path, seed):
             progress.update(trainer.step_count, {k: f"{v:.3g}" for k, v in means.items()})
             recent = []
             save(path, trainer, opt, curve, seed)
+    save(path, trainer, opt, curve, seed)  # also what --minutes ended between two lines
 
 
 def save(path, trainer, opt, curve, seed):

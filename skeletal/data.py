@@ -20,6 +20,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from human import PARENTS as HUMAN_PARENTS
 from human import (
@@ -40,6 +41,7 @@ from skeletal.layers import ROOT, Graph, match_primal
 RATE = 30.0
 CONTACT_SPEED, CONTACT_HEIGHT = 0.45, 0.22  # legs a second, legs above the lowest: ASSUMED, 0.4 m/s and 0.2 m of a man
 BLEND = 5  # frames before and after a contact  [SAN, published code]
+LOWEST = 10  # per cent of the frames in which a foot stands: there is the floor; in others it may be on tiptoe. ASSUMED
 STUB, LENGTHS = 0.12, 0.3  # ASSUMED: a bone shorter than this share of its chain is merged; +- 30 %
 
 
@@ -681,6 +683,8 @@ def contacts(m: Motion) -> np.ndarray:
     """
     p, _ = pose(m)
     out = np.zeros((len(m), len(m.skeleton.feet)), bool)
+    if len(m) == 1:  # a pose has no speed
+        return out
     for i, f in enumerate(m.skeleton.feet):
         speed = np.linalg.norm(np.gradient(p[:, f], axis=0), axis=1) * RATE / m.skeleton.leg
         low = p[:, f, 2] - np.percentile(p[:, f, 2], 5) < CONTACT_HEIGHT * m.skeleton.leg
@@ -689,11 +693,24 @@ def contacts(m: Motion) -> np.ndarray:
 
 
 def stand_heights(m: Motion, standing) -> np.ndarray:
-    """(F,) how high a foot's end is while it stands, in legs: the median; the lowest of one that never stands.
+    """(F,) how high a foot's end is where it stands, in legs: the lowest tenth's; the lowest of one that never stands.
 
     Test      tests/skeletal/test_skeletal_data.py::test_stand_heights"""
     z = pose(m)[0][:, list(m.skeleton.feet), 2] / m.skeleton.leg
-    return np.array([np.median(h[s]) if s.any() else h.min() for h, s in zip(z.T, standing.T)])
+    return np.array([np.percentile(h[s], LOWEST) if s.any() else h.min() for h, s in zip(z.T, standing.T)])
+
+
+def lowered(m: Motion, standing, heights) -> Motion:
+    """The body moved up or down, smoothly in time, so that feet that stand are at their heights (T, F) [m] in the mean.
+
+    Test      tests/skeletal/test_skeletal_data.py::test_feet_come_to_the_floor"""
+    some = standing.any(axis=1)
+    if not some.any():
+        return m
+    off = np.where(standing, heights - pose(m)[0][:, list(m.skeleton.feet), 2], 0.0).sum(axis=1)
+    t = np.arange(len(m))
+    off = np.interp(t, t[some], off[some] / standing[some].sum(axis=1))
+    return replace(m, pos=m.pos + [0.0, 0.0, 1.0] * gaussian_filter1d(off, BLEND, mode="nearest")[:, None])
 
 
 def clean_feet(m: Motion, standing, heights=None) -> Motion:
@@ -701,31 +718,33 @@ def clean_feet(m: Motion, standing, heights=None) -> Motion:
     frames with a smooth step; by damped least squares on the leg; the foot keeps its orientation.  A leg that ends at
     the ankle is solved for its end.
 
+    Equation  shift = sum_k v_k w_k (goal_k - p_k) / sum_k v_k,  v = w / (1 - w), w the smooth step of stance k, p_k the
+              foot, before and after the stance at its edge: within a stance it alone counts
     Args      standing : (T, F) contacts of the input motion; heights : (T, F) [m], where its feet's ends should be:
-              the body is shifted so that those that stand are there in the median, and each is brought there.  ASSUMED
-    Test      tests/skeletal/test_skeletal_data.py::test_foot_cleanup, test_feet_come_to_the_floor
+              the body is `lowered`, and each stance's mean height is the wanted one.  ASSUMED
+    Test      tests/skeletal/test_skeletal_data.py::test_foot_cleanup, test_feet_come_to_the_floor,
+              test_stances_are_blended
     """
-    out = m
-    if heights is not None and standing.any():
-        off = heights - pose(m)[0][:, list(m.skeleton.feet), 2]
-        out = replace(m, pos=m.pos + [0.0, 0.0, np.median(off[standing])])
+    out = m if heights is None else lowered(m, standing, heights)
     for i, f in enumerate(m.skeleton.feet):
         chain = _limb(m.skeleton, f)
         if len(chain) < 3:
             continue
         ankle, leg = (m.skeleton.parents[f], chain[:-2]) if len(chain) > 3 else (f, chain[:-1])
         p, g = pose(out)
-        shift, weight = np.zeros((len(m), 3)), np.zeros(len(m))
+        shift, shares = np.zeros((len(m), 3)), np.zeros((len(m), 1))
         edges = np.flatnonzero(np.diff(np.concatenate([[0], standing[:, i].astype(int), [0]])))
         for a, b in edges.reshape(-1, 2):
             goal = p[a:b, f].mean(axis=0)
             if heights is not None:
                 goal[2] = heights[a:b, i].mean()
-            for t in range(max(a - BLEND, 0), min(b + BLEND, len(m))):
-                away = max(a - t, t - b + 1, 0) / (BLEND + 1)
-                w = 1 - away * away * (3 - 2 * away)
-                if w > weight[t]:
-                    weight[t], shift[t] = w, w * (goal - p[min(max(t, a), b - 1), f])
+            t = np.arange(max(a - BLEND, 0), min(b + BLEND, len(m)))
+            away = np.maximum(a - t, t - b + 1).clip(0) / (BLEND + 1)
+            w = (1 - away * away * (3 - 2 * away))[:, None]
+            v = w / (1 - w + 1e-9)
+            shift[t] += v * w * (goal - p[t.clip(a, b - 1), f])
+            shares[t] += v
+        shift /= np.maximum(shares, 1e-12)
         keep = g[:, ankle].copy()
         out = solve_ik(out, [(ankle, p[:, ankle] + shift, leg, _stiffness(m.skeleton, leg))])
         out = _hold(out, ankle, keep)

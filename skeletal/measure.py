@@ -156,7 +156,7 @@ def sheets(net: Correction, found, opt):
         if name not in drawn:
             drawn.add(name)
             got = net.clean(net(m, source, true.skeleton, target), m, source, target)
-            path, labels = Path(opt.png) / f"{name}.png", ["source", "network, cleaned", "truth"]
+            path, labels = Path(opt.png) / f"{name}.png", ["source", "cleaned", "truth"]
             draw([m, got, true], labels, path, None, opt.every, (0, 1, 1))
 
 
@@ -188,11 +188,14 @@ def measure(argv) -> int:
     """python -m skeletal measure.  Test: tests/skeletal/test_skeletal_correct.py::test_measure"""
     opt = cli(MeasureOptions, argv, "python -m skeletal measure", MeasureOptions.__doc__)
     check_folders(opt.json, opt.png)
-    make_folder(opt.png)
     nets = [Correction(p) for p in opt.weights.split(",")]
     if any(n.names != nets[0].names for n in nets):
         raise UserError(f"--weights {opt.weights}: trained on different rigs; valid: seeds of one training")
     found = cases(nets[0], opt)
+    if not found:
+        names = ", ".join(nets[0].names)
+        raise UserError(f"--weights {opt.weights}: no clip of {names} is at hand; valid: --motion FOLDER")
+    make_folder(opt.png)
     result = table(nets, found)
     result |= summary(result["pairs"])
     head = f"{'':22s}" + "".join(f"{r:>32s}" for r in ROWS)

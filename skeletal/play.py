@@ -199,10 +199,15 @@ def target_body(net: Correction, target, up, drop):
     """
     if not target.lower().endswith(".bvh"):
         return net.index(target), net.sides[net.index(target)].rig.skeleton
+    fits = []
     for k, side in enumerate(net.sides):
         raw = data.read_rig(target, up, (*drop, *rigs.DROPPED.get(side.rig.name, ())))
         if set(raw.names) == set(side.names):
-            return k, data.to_motion(raw, side.rig.structure).skeleton
+            body = data.to_motion(raw, side.rig.structure).skeleton
+            far = min(np.abs(body.offsets / body.leg - b.offsets / b.leg).max() for b in side.bodies)
+            fits.append((far, k, body))
+    if fits:  # Jesse, Oppy and Dino have the same joints: the one whose proportions are nearest
+        return min(fits, key=lambda fit: fit[:2])[1:]
     known = "; or ".join(f"{s.rig.name}: {', '.join(s.names)}" for s in net.sides)
     raise UserError(f"{target}: no trained rig has its joints, {', '.join(raw.names)}; valid: {known}")
 

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 import character
+from human import quat_about, quat_mul
 from mocap import bvh
 from mocap import data as captures
 from plumbing.cli import UserError, cli, run_main
+from plumbing.runs import load_checkpoint, save_checkpoint
 from retarget import retarget, write_bvh
-from skeletal import correct, data, measure, rigs
+from skeletal import correct, data, measure, play, rigs
 from skeletal.__main__ import main
 
 
@@ -56,8 +58,9 @@ def test_gather_is_unpaired(sides):
         correct.gather(options("--rigs", "human,bandai"))
     with pytest.raises(UserError, match="wolf: no such rig"):
         correct.gather(options("--rigs", "human,wolf"))
-    with pytest.raises(UserError, match="one rig; valid: two or more"):
-        correct.gather(options("--rigs", "human"))
+    for given in ("human", "dino,dino"):
+        with pytest.raises(UserError, match="one rig, or one twice; valid: two or more"):
+            correct.gather(options("--rigs", given))
 
 
 def test_limbs(sides, clips):
@@ -184,24 +187,60 @@ def test_train_ship_use(trained, sides, clips, tmp_path):
 
 
 def test_results_stand_on_the_floor(trained, sides):
-    """Cleaned, standing feet are as high as the target's stand in its own clips, and as much above that as the
-    source's; not cleaned, they are not."""
+    """Cleaned, standing feet are as high as the target's in its own clips, and as much above that as the source's are
+    above its rig's; a foot that is held up all the time stays up."""
     net = correct.Correction(trained / "correct-0.npz")
-    np.testing.assert_array_equal(net.sides[1].stand, sides[1].stand)
+    a, b = sides[0].stand, net.sides[1].stand
+    np.testing.assert_array_equal(b, sides[1].stand)
     heights = np.array([data.stand_heights(m, data.contacts(m)) for _, m in sides[1].clips])
     middle = [(len(heights) - 1) // 2, len(heights) // 2]
-    np.testing.assert_allclose(sides[1].stand, np.sort(heights, axis=0)[middle].mean(axis=0))
-    m = sides[0].clips[0][1]
-    standing, body = data.contacts(m), net.sides[1].rig.skeleton
-    got = net(m, 0, body, 1)
-    got = replace(got, pos=got.pos + [0.0, 0.0, 0.1])  # a result that floats
-    z = data.pose(m)[0][:, list(m.skeleton.feet), 2] / m.skeleton.leg
-    wanted = body.leg * (net.sides[1].stand + z - data.stand_heights(m, standing))
-    off = lambda r: np.abs(data.pose(r)[0][:, list(body.feet), 2] - wanted)[standing].mean()  # noqa: E731
-    assert off(net.clean(got, m, 0, 1)) < 0.02 and off(got) > 0.05
+    np.testing.assert_allclose(b, np.sort(heights, axis=0)[middle].mean(axis=0))
+    m, body = sides[0].clips[0][1], net.sides[1].rig.skeleton
+    z = lambda r: data.pose(r)[0][:, list(r.skeleton.feet), 2]  # noqa: E731
+    for up in (0.0, 0.4):
+        high = replace(m, pos=m.pos + [0.0, 0.0, up])  # the source's floor is elsewhere
+        standing = data.contacts(high)
+        got = net(high, 0, body, 1)
+        floor = min(data.stand_heights(high, standing) - a)
+        wanted = body.leg * (b + z(high) / m.skeleton.leg - a - floor)
+        off = lambda r: np.abs(z(r) - wanted)[standing].mean()  # noqa: E731, B023
+        assert off(net.clean(got, high, 0, 1)) < 0.02 and off(replace(got, pos=got.pos + [0.0, 0.0, 0.1])) > 0.05
     low = replace(got, pos=got.pos - [0.0, 0.0, 0.03])
     assert measure.floating(low, got, standing) == pytest.approx(0.03)
     assert measure.floating(low, got, np.zeros_like(standing)) == 0.0
+
+    s = m.skeleton  # standing on the right leg: the left thigh is raised, the left shin hangs
+    thigh, shin = s.names.index("thigh_l"), s.names.index("shin_l")
+    quat = np.repeat(m.quat[:1], 40, 0)
+    quat[:, thigh] = quat_mul(quat[:, thigh], quat_about(1, np.full(40, -1.2)))
+    quat[:, shin] = quat_mul(quat[:, shin], quat_about(1, np.full(40, 1.2)))
+    crane = replace(m, pos=np.repeat(m.pos[:1], 40, 0), quat=quat)
+    assert (z(crane)[:, 0] - z(crane)[:, 1]).min() > 0.3
+    cleaned = net.clean(net(crane, 0, body, 1), crane, 0, 1)
+    assert np.abs(z(cleaned)[:, 1] - body.leg * b[1]).max() < 0.02 and z(cleaned)[:, 0].min() > 0.1
+
+
+def test_minutes(clips, tmp_path):
+    """What --minutes ends is kept, with the steps that it had."""
+    args = ("--rigs", "human,dino", "--steps", 400, "--batch", 2, "--minutes", 1e-4, "--out", tmp_path / "a")
+    assert run("correct", *args) == 0
+    assert 0 < correct.Correction(tmp_path / "a" / "correct-0.npz").meta["steps"] < 50
+
+
+def test_damaged_weights(trained, tmp_path, capsys):
+    """Arrays of another size, with NaN, or without standing heights are refused in a line."""
+    arrays, meta = load_checkpoint(trained / "correct-0.npz")
+    bad = {"generator1": (arrays["generator1"][:1], "generator1 has 1 numbers"),
+           "stand1": (arrays["stand1"][:1], "stand1 has not 2 numbers"),
+           "offsets1": (np.nan * arrays["offsets1"], "'offsets1' holds NaN")}  # fmt: skip
+    for name, (value, said) in bad.items():
+        save_checkpoint(tmp_path / "b.npz", arrays | {name: value}, meta)
+        with pytest.raises(UserError, match=said):
+            correct.Correction(tmp_path / "b.npz")
+    old = {k: v for k, v in arrays.items() if not k.startswith("stand")}
+    save_checkpoint(tmp_path / "b.npz", old, meta)
+    with pytest.raises(UserError, match="has no standing heights, as older files; valid: trained anew"):
+        correct.Correction(tmp_path / "b.npz")
 
 
 def test_retarget_any_human(trained, tmp_path, clips, capsys):
@@ -265,6 +304,17 @@ def test_retarget_to_a_static_skeleton(trained, tmp_path, clips, capsys):
     assert "no trained rig has its joints" in capsys.readouterr().err
 
 
+def test_nearest_body(tmp_path):
+    """Jesse's, Oppy's and Dino's joints are the same: a file is of the one whose proportions it has."""
+    net = correct.Correction(correct.SHIPPED)
+    for name in ("jesse", "oppy", "dino"):
+        k = net.index(name)
+        rig = net.sides[k].rig
+        m = data.Motion("t", rig.skeleton, np.tile([0.0, 0.0, 1.0], (2, 1)), np.tile([1.0, 0, 0, 0], (2, 21, 1)))
+        data.write_motion(tmp_path / "t.bvh", m, replace(rig.structure, up="y", unit=0.01))
+        assert play.target_body(net, str(tmp_path / "t.bvh"), "y", ())[0] == k
+
+
 def test_end_error(sides):
     """A hand that is off by its limb's length counts one; the mean is over five ends."""
     m = sides[0].clips[0][1]
@@ -291,6 +341,10 @@ def test_measure(trained, tmp_path, capsys):
     each = [s["network"]["ee"] for s in r["seeds"]["human-dino"]]
     assert len(each) == 2 and rows["network"]["ee"] == pytest.approx(np.mean(each))
     assert "human-dino" in capsys.readouterr().out
+    assert run("correct", "--rigs", "jesse,dino", "--steps", 1, "--batch", 2, "--out", tmp_path / "c") == 0
+    args = ("--weights", tmp_path / "c" / "correct-0.npz", "--png", tmp_path / "sheets")
+    assert run("measure", *args) == 2 and "no clip of jesse, dino is at hand" in capsys.readouterr().err
+    assert not (tmp_path / "sheets").exists()
 
 
 def test_rebased(sides):
