@@ -2,8 +2,8 @@ r"""Two auto-encoders that denoise: skeletal against plain temporal convolution 
 
     x + noise ──► E ──► latent ──► D ──► r ──► y = x + noise + r ──► FK ──► positions
 
-Both decoders add to their noisy input.  Without that, a latent a third as large as the input loses 30 times what the
-noise does (skeletal/REPRODUCE.md, part 3).  A joint whose quaternion was zeroed has only r to turn by, since a
+Both decoders add to their noisy input.  Without that, a latent a third as large as the input loses 30 to 100 times what
+the noise does (skeletal/REPRODUCE.md, part 3).  A joint whose quaternion was zeroed has only r to turn by, since a
 quaternion is divided by its length: a small r everywhere fills the gaps and hardly moves the rest.
 """
 

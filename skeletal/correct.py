@@ -5,8 +5,8 @@ r"""A copy and a learnt correction: skeleton-aware networks for minutes of one c
 
 [SAN-3] decodes the whole pose.  After 40 minutes of one core that has not caught up with a copy of rotations in the
 target's statistics (skeletal/REPRODUCE.md, part 3).  Here the decoder adds to a copy, and its last layer starts at
-zero, so that training begins at the copy.  Layers, encoders, decoders and critics are the paper's, of
-`skeletal.net`; all rigs share one latent space and one primal skeleton.  Still no pairs.
+zero, so that training begins at the copy.  Layers, encoders, decoders and, with --adv, critics are the
+paper's, of `skeletal.net`; all rigs share one latent space and one primal skeleton.  Still no pairs.
 
     python -m skeletal correct --motion FOLDER --rigs human,bandai,dino --out runs/c
 """
@@ -193,7 +193,7 @@ def stand_loss(world, feet, standing):
 
 @dataclass
 class CorrectOptions:
-    """Train corrections of copies between rigs, unpaired."""
+    """Train corrections of copies between rigs, unpaired.  The weights are ASSUMED."""
 
     motion: str | None = arg(None, "folder that holds bandai, lafan1, cmu-inplace; left out: the built-in human alone")
     rigs: str = arg("human,jesse,oppy,dino", "rigs, commas between them: " + ", ".join(rigs.RIGS))
@@ -316,8 +316,8 @@ class Corrector:
     def direction(self, m, n, batch):
         r"""A = m to B = n: the correction, its losses, all gradients by hand.
 
-        Equation  L = w_stay |r|^2 + w_limb L_limb + w_ee L_ee [SAN-7] + w_stand L_stand + w_ltc L_ltc [SAN-5]
-                  + w_adv L_adv [SAN-6]
+        Equation  L = w_stay |r|^2 (20 times within a rig) + w_limb L_limb + w_ee L_ee [SAN-7] + w_stand L_stand
+                  + w_ltc L_ltc [SAN-5] + w_adv L_adv [SAN-6]
         Returns   losses; (fake bones, S_B) for the critic
         """
         A, B, w = self.sides[m], self.sides[n], self.weights

@@ -41,9 +41,9 @@ class Choices:
     static_scale   : of the static features' share; 1: concatenated as printed; the code adds them times 0.01
     root_ends      : the root sees the end effectors, as printed; the code forgets them (its issue 30)
     ee_height      : divide end effectors' velocities by the whole height, as the code does, not by the chain's length
-    weights        : of rec, ltc, adv, ee in [SAN-8].  Printed: 1, 1, 0.25, 2; the author's later numbers, as the code
-                     multiplies them out: 5, 2.5, 1, 50, with another factor of 100 inside its L_ee.  That one is a mean
-                     over five ends and three axes where [SAN-7] prints a sum: 5000 / 15 = 333.  Ours: 300
+    weights        : of rec, ltc, adv, ee in [SAN-8].  Printed: 1, 1, 0.25, 2; the code's, which multiplies the author's
+                     later numbers out: 5, 2.5, 1, 50, with another factor of 100 inside its L_ee.  That one is a mean
+                     over five ends and three axes where [SAN-7] prints a sum: 5000 / 15 = 333.  Ours: 300 (ASSUMED)
     position       : weight of the position part of L_rec against the rotation part, in leg lengths squared (ASSUMED)
     path           : the same of the root's path (ASSUMED)
     carry_root     : the root's path and height, in legs, go from source to target, as the heading does (Departs);
@@ -555,7 +555,7 @@ def fk_forward(x, offsets, parents, turn):
     r"""Forward kinematics, quaternion normalisation included  [SAN-4's FK].
 
     Equation  G_0 = R(q_0/|q_0|), G_j = G_parent R(q_j/|q_j|), p_j = p_parent + G_parent S_j;
-              world: Rz(psi_t) p_j + (sum_{u<=t} Rz(psi_u) v_u, height_t)
+              world: Rz(psi_t) p_j + (sum_{0<u<=t} Rz(psi_u) v_u, height_t)
     Frame     bones and p in the heading frame of their frame; world: from the place on the floor of frame 0
     Args      x : (7 + 4 (J - 1), T, B) root velocity forward and left a frame, height, quaternion; a quaternion a joint
               offsets : (J, 3, B) [legs]; turn : (T, B) complex exp(i psi) of the heading, given, not learnt
