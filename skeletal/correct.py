@@ -551,25 +551,28 @@ def train(opt, trainer, path, seed):
 
     Test      tests/skeletal/test_skeletal_correct.py::test_minutes"""
     progress, recent, curve, start = Progress(opt.steps, 0, f"steps of seed {seed}"), [], [], time.process_time()
-    while trainer.step_count < opt.steps and time.process_time() - start < 60 * opt.minutes:
+    over = False
+    while not over:
         for adam in trainer.adams:
             adam.lr = opt.lr * (1.0 - 0.9 * trainer.step_count / opt.steps)
         if row := trainer.step():
             recent.append(row)
-        if recent and (trainer.step_count % 50 == 0 or trainer.step_count == opt.steps):
+        over = trainer.step_count >= opt.steps or time.process_time() - start >= 60 * opt.minutes
+        if not over and trainer.step_count % 50:
+            continue
+        if recent:
             means = {k: float(np.mean([r[k] for r in recent])) for k in recent[0]}
             curve.append({"step": trainer.step_count} | means)
             progress.update(trainer.step_count, {k: f"{v:.3g}" for k, v in means.items()})
             recent = []
-            save(path, trainer, opt, curve, seed)
-    save(path, trainer, opt, curve, seed)  # also what --minutes ended between two lines
+        save(path, trainer, opt, curve, seed)
 
 
 def save(path, trainer, opt, curve, seed):
     """Networks, statistics and bodies, with the data's licence.
 
     Test      tests/skeletal/test_skeletal_correct.py::test_train_ship_use"""
-    asked, motions = opt.rigs.split(","), ["builtin"]
+    asked, motions = [s.rig.name for s in trainer.sides], ["builtin"]
     if opt.motion:
         used = {"bandai": "bandai", "lafan1": "lafan1", "cmu": "cmu-inplace"}
         people = ("bandai", "cmu") if "human" in asked else ()
