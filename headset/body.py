@@ -12,6 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from headset.axes import Choice, choose
 from headset.bsor import opened
 from headset.calibration import Resampler, standing_height
 from headset.reader import Clock, Guard, Sample, files_of, to_world
@@ -29,16 +30,19 @@ STANCE = 0.085  # m, half the distance of standing feet, of a person of 1.75 m
 ELBOW = np.array([-0.5, 0.4, -0.8])  # where the left elbow points, in the chest's frame
 
 
-def read_recording(path, axes="unity", grip=None) -> tuple[np.ndarray, np.ndarray]:
+def read_recording(path, how: Choice | None = None) -> tuple[np.ndarray, np.ndarray]:
     """A recording's devices at the control rate, mended by the Guard.  -> pos (T, 3, 3), quat (T, 3, 4), our axes
 
+    Args      how : its axes, grip, unit and order of the devices; by default what `headset.axes.choose` finds
     Raises    UserError: it cannot be read, or shows no headset
-    Test      tests/headset/test_body.py::test_recordings"""
-    clock, guard, resampler, ticks = Clock(), Guard(), Resampler(CONTROL_RATE), []
+    Test      tests/headset/test_body.py::test_recordings, test_axes_of_players"""
+    how = how or choose(path)
+    order, clock, guard, resampler, ticks = list(how.order), Clock(), Guard(), Resampler(CONTROL_RATE), []
     for sample in opened(path)[1]:
         t = clock.stamp(sample.t)
         if t is not None:
-            for good in guard.push(Sample(t, *to_world(sample.pos, sample.quat, axes, grip))):
+            poses = to_world(sample.pos[order], sample.quat[order], how.axes, how.grip, how.unit)
+            for good in guard.push(Sample(t, *poses)):
                 ticks += resampler.push(good)
     if not ticks:
         raise UserError(f"{path}: shows no headset; valid: a recording of one")
@@ -166,15 +170,16 @@ def two_bone_arm(shoulder, wrist, elbow, a, b):
     return upper * half_turn, fore * half_turn
 
 
-def players(folder, axes="unity") -> list[Clip]:
+def players(folder) -> list[Clip]:
     """A body for every recording of a folder that shows a standing player; others are left out, and named.
 
+    Axes      each file's own, or those that fit it best (`headset.axes.choose`)
     Raises    UserError: no recordings there
-    Test      tests/headset/test_body.py::test_recordings"""
+    Test      tests/headset/test_body.py::test_recordings, test_axes_of_players"""
     out = []
     for file in files_of(folder):
         try:
-            pos, quat = read_recording(file, axes)
+            pos, quat = read_recording(file)
             height = standing_height(pos[:, 0])
             if not 1.0 <= height <= 2.1:
                 raise UserError(f"{file}: the headset is {height:.2f} m up; valid: 1.0 to 2.1 m, the floor at 0")

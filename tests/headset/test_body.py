@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from test_stream import to_csv
 
 from headset import body
-from human import SEG, contacts, headset_height, quat_matrix, sensors
+from human import SEG, contacts, heading, headset_height, quat_matrix, sensors
 from mocap import gait
 from mocap.data import Clip, load
 from plumbing.cli import UserError
@@ -95,6 +96,20 @@ def test_recordings(tmp_path, capsys):
     with pytest.raises(UserError, match="no recordings"):
         body.players(tmp_path)
     assert "left out: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("first, unit", [("# axes: openxr\n", 1.0), ("", 0.01)])
+def test_axes_of_players(worn, tmp_path, first, unit):
+    """In OpenXR's axes: a file that says so, and one in centimetres that does not; the devices are where they were."""
+    clip, (pos, quat) = worn
+    lines = to_csv(np.arange(len(pos)) / clip.rate, pos / unit, quat, "openxr")
+    (tmp_path / "a.csv").write_text(first + "".join(lines))
+    [found] = body.players(tmp_path)
+    p, q = sensors(found)
+    np.testing.assert_allclose(p, pos[: len(p)], atol=1e-5)
+    yaw = heading(q[:, 0])
+    ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)[:, None]
+    assert np.sum((p[:, 1:] - p[:, :1])[..., :2] * ahead, axis=-1).mean() > 0.1
 
 
 @pytest.mark.skipif("MOCAP_DIR" not in os.environ, reason="MOCAP_DIR is not set: real recordings lie beside it")
