@@ -77,9 +77,10 @@ class StreamFlags:
         None, "how far the fingers point below the controllers' forward axis [degrees]: unity 15, else 90 by default"
     )
     stream_unit: float | None = arg(None, "metres a unit of the stream; its axes' own by default", check=POSITIVE)
-    devices: tuple[str, ...] = arg(
-        DEVICES,
-        "which of the stream's devices are head, left and right, as left,head,right",
+    devices: tuple[str, ...] | None = arg(
+        None,
+        "which of the stream's devices are head, left and right, as left,head,right; by default as they are named, or "
+        "as --axes auto finds them",
         check=(lambda v: sorted(v) == sorted(DEVICES), "head, left and right, each once"),
     )
     sample_rate: float = arg(SAMPLE_RATE, "rows a second of a stream without times", check=POSITIVE)
@@ -515,7 +516,7 @@ def source_of(char: Character, path, devices: int, opt: Options):
     """The stream's reading as the options say, or as fits it best; and what to say about that.
 
     Test      tests/headset/test_stream.py::test_axes_are_found"""
-    order = tuple(map(DEVICES.index, opt.devices))
+    order = tuple(map(DEVICES.index, opt.devices)) if opt.devices else None
     how = axes.choose(path, opt.axes, opt.grip, opt.stream_unit, order, devices)
     source = calibration.Stream(
         char,

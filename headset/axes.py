@@ -44,6 +44,8 @@ PERSON = 4.0  # of at most 8: what reads like a person.  Recorded: 4.5 to 6.3, 3
 SURE = 0.6  # by how much a fit must be better to be said.  ASSUMED
 OTHER_GRIP = 0.3  # what it costs that a controller is not held as these axes' own are.  ASSUMED
 GRIP_OFF = 45.0  # degrees from a forearm to where the grip says that the fingers are
+USUAL = (0, 1, 2)  # order of the devices: head, left, right
+FOUND, OWN = "axes found from head, hands and forearms:", "axes as the file itself says:"
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,14 @@ class Choice(NamedTuple):
     unit: float | None
     order: tuple
     lines: list
+
+    @property
+    def usual(self) -> bool:
+        """Whether nothing need be said: Unity's axes without doubt, and the devices as most files have them.
+
+        Test      tests/headset/test_axes.py::test_usual"""
+        plain = f"{FOUND} --axes unity --grip {GRIP['unity']:g}", f"{OWN} --axes unity"
+        return set(self.lines) <= set(plain)
 
 
 # ------------------------------------------------------------------------------------ what tells
@@ -111,7 +121,7 @@ def levers(t, pos, quat) -> dict:
     return {(h, k): lever(t, pos[:, k] - pos[:, h], own[:, k]) for h, k in permutations(range(3), 2)}
 
 
-def fit(t, pos, quat, swings, axes, order=(0, 1, 2), unit: float | None = 1.0) -> Fit:
+def fit(t, pos, quat, swings, axes, order=USUAL, unit: float | None = 1.0) -> Fit:
     r"""How well axes, an order of the devices and a unit fit a person.
 
     Cues      head upright; headset at 0.5 to 2.3 m, or, with a floor of its own, at ±0.5 m; hands below it by 0.3 m
@@ -161,24 +171,25 @@ def fit(t, pos, quat, swings, axes, order=(0, 1, 2), unit: float | None = 1.0) -
     return Fit(axes, tuple(order), unit, score, forearm)
 
 
-def fits(samples, devices=3) -> list[Fit]:
+def fits(samples, devices=3, order=None) -> list[Fit]:
     """Every axes and order of the devices, best first; none if the samples are too few, or the headset is alone.
 
-    Test      tests/headset/test_axes.py::test_wrong_axes, ::test_few"""
+    Args      order : of the devices, the only one that is tried
+    Test      tests/headset/test_axes.py::test_wrong_axes, ::test_few, ::test_told"""
     samples = tracked(samples, devices)
     if devices < 3 or len(samples) < 20:
         return []
     t, pos, quat = (np.array([s[k] for s in samples]) for k in range(3))
     if not np.isfinite(t).all() or t[-1] - t[0] < 0.5 * SECONDS[0]:
         t = np.arange(len(t)) / 90.0
-    unit = unit_of(pos)
+    unit = unit_of(pos[:, list(order or USUAL)])
     swings = levers(t, pos, quat)
-    orders = list(permutations(range(3))) if unit else [(0, 1, 2)]
+    orders = [tuple(order)] if order else list(permutations(range(3))) if unit else [USUAL]
     found = []
     for some in (orders[:2], orders[2:]):  # the headset first; elsewhere only if nobody wears it there
         if not found or max(f.score for f in found) < PERSON:
             found += [fit(t, pos, quat, swings, axes, order, unit) for axes in NAMES for order in some]
-    return sorted(found, key=lambda f: SWAPPED * (f.order != (0, 1, 2)) - f.score)
+    return sorted(found, key=lambda f: SWAPPED * (f.order != USUAL) - f.score)
 
 
 def unit_of(pos) -> float | None:
@@ -192,7 +203,7 @@ def unit_of(pos) -> float | None:
 # ------------------------------------------------------------------------------------ what is said
 
 
-def judge(samples, axes="unity", grip=None, unit=None, order=(0, 1, 2), devices=3) -> list[str]:
+def judge(samples, axes="unity", grip=None, unit=None, order=USUAL, devices=3) -> list[str]:
     """What does not fit a person in how samples are read, each with the flag that mends it.
 
     Args      samples : a second or more of Reader's; the rest as they are read now
@@ -212,7 +223,7 @@ def judge(samples, axes="unity", grip=None, unit=None, order=(0, 1, 2), devices=
         lines.append(
             f"the controllers fit a person's arms in {name}, not at {used:g} m a unit: --stream-unit {best.unit:g}"
         )
-    gain = best.score - told.score - SWAPPED * ((best.order != (0, 1, 2)) - (told.order != (0, 1, 2)))
+    gain = best.score - told.score - SWAPPED * ((best.order != USUAL) - (told.order != USUAL))
     if best is not told and gain > SURE:
         if best.order != told.order:
             lines.append(other_order(best))
@@ -246,24 +257,28 @@ def grip_of(forearm) -> float:
     return min(set(GRIP.values()), key=lambda g: abs(g - forearm))
 
 
-def guess(samples, axes="unity", devices=3) -> Choice:
+def guess(samples, axes="unity", devices=3, grip=None, unit=None, order=None) -> Choice:
     """Axes, grip, unit and order of the devices that fit a person best; `axes` where nothing tells.
 
-    Test      tests/headset/test_axes.py::test_recorded, ::test_wrong_axes"""
-    found = fits(samples, devices)
+    Args      grip, unit, order : what the user gave, or None; they count
+    Test      tests/headset/test_axes.py::test_recorded, ::test_wrong_axes, ::test_told"""
+    found = fits(samples, devices, order)
     if not found:
-        return Choice(axes, None, None, (0, 1, 2), [f"too little to tell the axes from: --axes {axes}"])
+        line = f"too little to tell the axes from: --axes {axes}"
+        return Choice(axes, grip, unit, tuple(order or USUAL), [line])
     best = found[0]
     rest = [f for f in found if f.axes != best.axes and f.order == best.order]
     lead = best.score - max(f.score for f in rest)
-    grip = GRIP[best.axes]
-    if best.forearm is not None and abs(best.forearm - grip) > GRIP_OFF:
-        grip = grip_of(best.forearm)
-    order = "" if best.order == (0, 1, 2) else f" {devices_flag(best)}"
-    unit = None if best.unit in (None, UNIT.get(best.axes, 1.0)) else best.unit
-    flags = f"--axes {best.axes} --grip {grip:g}{order}" + (f" --stream-unit {unit:g}" if unit else "")
+    if grip is None:
+        grip = GRIP[best.axes]
+        if best.forearm is not None and abs(best.forearm - grip) > GRIP_OFF:
+            grip = grip_of(best.forearm)
+    if unit is None:
+        unit = None if best.unit in (None, UNIT.get(best.axes, 1.0)) else best.unit
+    flags = f"--axes {best.axes} --grip {grip:g}" + ("" if best.order == USUAL else f" {devices_flag(best)}")
+    flags += f" --stream-unit {unit:g}" if unit else ""
     sure = "" if lead > SURE else f"; not sure: {rest[0].axes} fits nearly as well"
-    return Choice(best.axes, grip, unit, best.order, [f"axes found from head, hands and forearms: {flags}{sure}"])
+    return Choice(best.axes, grip, unit, best.order, [f"{FOUND} {flags}{sure}"])
 
 
 # ------------------------------------------------------------------------------------ a file, a live stream
@@ -301,27 +316,27 @@ def lie(samples) -> bool:
     return len(pos) > 0 and bool((pos[:, 1:].std(axis=0) * (unit_of(pos) or 1.0) < LIES).all())
 
 
-def choose(path, wanted="auto", grip=None, unit=None, order=(0, 1, 2), devices=3) -> Choice:
+def choose(path, wanted="auto", grip=None, unit=None, order=None, devices=3) -> Choice:
     """How to read a stream: as wanted, with complaints about what does not fit; or, for "auto", as fits best.
 
     A live stream cannot be read twice: for it "auto" is Unity's axes, and `Watch` complains as it goes on.  A replay's
     axes are known: Unity's.
     Args      grip, unit, order : what the user gave, or None; they count
-    Test      tests/headset/test_axes.py::test_choose"""
+    Test      tests/headset/test_axes.py::test_choose, ::test_told"""
+    plain = tuple(order or USUAL)
     if wanted != "auto" and wanted not in AXES:
         raise UserError(f"--axes {wanted}: unknown; valid: auto, {', '.join(AXES)}")
     if is_live(path) or wanted == "auto" and is_replay(path):
-        return Choice("unity" if wanted == "auto" else wanted, grip, unit, tuple(order), [])
+        return Choice("unity" if wanted == "auto" else wanted, grip, unit, plain, [])
     if wanted == "auto" and (own := axes_in(path, devices)):
-        return Choice(own, grip, unit, tuple(order), [f"axes as the file itself says: --axes {own}"])
+        return Choice(own, grip, unit, plain, [f"{OWN} --axes {own}"])
     samples = beginning(path, devices)
     if devices == 3 and lie(samples):  # until somebody takes them
         samples = beginning(path, devices, LONG)
     if wanted == "auto":
-        found = guess(samples, devices=devices)
-        return found._replace(grip=found.grip if grip is None else grip, unit=found.unit if unit is None else unit)
-    lines = [f"{line}, or --axes auto" for line in judge(samples, wanted, grip, unit, order, devices)]
-    return Choice(wanted, grip, unit, tuple(order), lines)
+        return guess(samples, devices=devices, grip=grip, unit=unit, order=order)
+    lines = [f"{line}, or --axes auto" for line in judge(samples, wanted, grip, unit, plain, devices)]
+    return Choice(wanted, grip, unit, plain, lines)
 
 
 class Watch:
@@ -329,7 +344,7 @@ class Watch:
 
     Test      tests/headset/test_axes.py::test_watch"""
 
-    def __init__(self, axes="unity", grip=None, unit=None, order=(0, 1, 2), devices=3):
+    def __init__(self, axes="unity", grip=None, unit=None, order=USUAL, devices=3):
         self.how, self.seen, self.said, self.due = (axes, grip, unit, order, devices), [], set(), list(SECONDS)
 
     def push(self, sample: Sample) -> list[str]:

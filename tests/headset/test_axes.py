@@ -11,7 +11,7 @@ from test_stream import sensors_dir, to_csv  # noqa: F401, a fixture
 
 from headset import axes
 from headset.axes import NAMES, beginning, choose, fits, guess, judge, lever, tracked, unit_of
-from headset.reader import AXES, UNIT, Reader, Sample, to_world
+from headset.reader import AXES, COLUMNS, UNIT, Reader, Sample, to_world
 from human import quat_about, quat_mul, quat_rotate, sensors
 from plumbing.cli import UserError
 
@@ -162,6 +162,38 @@ def test_choose(tmp_path):
     path.write_text("".join(lines_of_user()[:3]))
     assert "too little" in choose(path).lines[0]
     assert len(beginning(path)) == 2
+
+
+def test_told(tmp_path):
+    """With --axes auto what the user says of order, grip and unit counts, and the axes are found around it."""
+    shuffled, path = in_axes("openxr", order=(1, 0, 2), unit=0.01), tmp_path / "s.csv"
+    assert {f.order for f in fits(shuffled, order=(1, 0, 2))} == {(1, 0, 2)}
+    rows = [np.concatenate([s.pos, s.quat], axis=1).ravel() for s in in_axes("unity", order=(0, 2, 1))]
+    text = [",".join(COLUMNS), *(",".join(map(str, [t, *row])) for t, row in zip(user()[0], rows))]
+    path.write_text("\n".join(text) + "\n")
+    for order in ((0, 2, 1), (0, 1, 2)):
+        found = choose(path, order=order, grip=40.0, unit=0.5)
+        assert (found.order, found.grip, found.unit) == (order, 40.0, 0.5)
+        assert "--grip 40" in found.lines[0] and "--stream-unit 0.5" in found.lines[0]
+    assert choose(path, order=(0, 2, 1)).axes == "unity" and choose(path).order == (0, 2, 1)
+    path.write_text("\n".join(text[:4]) + "\n")
+    little = choose(path, order=(0, 2, 1), grip=40.0)
+    assert "too little" in little.lines[0] and (little.order, little.grip) == ((0, 2, 1), 40.0)
+    assert choose("-", order=(2, 0, 1)).order == (2, 0, 1)
+
+
+def test_usual(tmp_path):
+    """Nothing need be said of Unity's axes; of all else, and of what is not sure, something."""
+    path = tmp_path / "u.csv"
+    path.write_text("".join(lines_of_user()))
+    assert choose(path).usual and choose("-").usual
+    assert not any(choose(path, **k).usual for k in ({"order": (0, 2, 1)}, {"unit": 0.02}, {"wanted": "openxr"}))
+    path.write_text("# axes: unity\n" + "".join(lines_of_user()))
+    assert choose(path).usual
+    for lines in (lines_of_user("openxr"), lines_of_user()[:3]):
+        path.write_text("".join(lines))
+        assert not choose(path).usual
+    assert not guess(in_axes(unit=0.01)).usual and not guess(in_axes(order=(0, 2, 1))).usual
 
 
 def test_watch():
