@@ -45,7 +45,7 @@ from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_acti
 from mocap.augment import resize
 from mocap.data import CONTROL_RATE
 from mocap.rigs import Reading
-from plumbing.cli import NONNEGATIVE, PNG, POSITIVE, UserError, arg, cli, given_flags, run_main
+from plumbing.cli import NONNEGATIVE, PNG, POSITIVE, UserError, arg, cli, given_flags, printable, run_main
 from plumbing.files import atomic_write, check_folders
 from policy import check_fits
 from retarget import Reference, forward_kinematics
@@ -407,13 +407,18 @@ def film(arms: list[Arm], clip, opt: Options, numbers, size=(480, 480)):
 KEPT = 600.0  # s of a stream that are kept for pictures and BVH, at most
 
 
+def say(lines, path=None) -> None:
+    """Print lines, of a file by its name.  Test: tests/headset/test_stream.py::test_what_is_said_of_a_folder"""
+    for line in lines:
+        print(printable(f"{path}: {line}" if path else line), flush=True)
+
+
 def watched(samples, watch: axes.Watch):
     """The samples of a live stream; what does not fit a person is said as it comes.
 
     Test      tests/headset/test_stream.py::test_axes_are_found"""
     for sample in samples:
-        for line in watch.push(sample):
-            print(line, flush=True)
+        say(watch.push(sample))
         yield sample
 
 
@@ -429,11 +434,11 @@ def follow(char: Character, policy, path, devices: int, opt, see, pace: Pace | N
     read = 1 if opt.sensors == "hmd" else devices
     player = Player(char, policy.mean_action, force=push.force if push else None, devices=devices)
     check_fits(policy, player, path)
-    source, said = source_of(char, opt.stream, read, opt)
+    source, how = source_of(char, opt.stream, read, opt)
     reader, samples = opened(opt.stream, strict=not live, devices=read)
     if live:  # a file's axes were looked at before
         samples = watched(samples, axes.Watch(source.axes, source.grip, source.unit, tuple(source.order), read))
-    print(*said, sep="\n", end="\n" if said else "", flush=True)
+    say(how.lines)
     if live and pace:
         samples = arriving(samples, GAP, player.dt)
     with contextlib.suppress(KeyboardInterrupt):  # the end of a live stream; what happened is still told
@@ -513,7 +518,7 @@ def recordings_of(path) -> list[Path]:
 
 
 def source_of(char: Character, path, devices: int, opt: Options):
-    """The stream's reading as the options say, or as fits it best; and what to say about that.
+    """The stream's reading as the options say, or as fits it best; and that choice, with what to say about it.
 
     Test      tests/headset/test_stream.py::test_axes_are_found"""
     order = tuple(map(DEVICES.index, opt.devices)) if opt.devices else None
@@ -528,7 +533,7 @@ def source_of(char: Character, path, devices: int, opt: Options):
         unit=how.unit,
         order=how.order,
     )
-    return source, how.lines
+    return source, how
 
 
 def ticks_of(char: Character, path, devices: int, opt: Options):
@@ -536,12 +541,11 @@ def ticks_of(char: Character, path, devices: int, opt: Options):
 
     Raises    UserError: it cannot be read, or shows no headset for a second
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
-    source, said = source_of(char, path, devices, opt)
+    source, how = source_of(char, path, devices, opt)
     ticks = [tick for sample in opened(path, devices=devices)[1] for tick in source.push(sample)]
     if not ticks:
         raise UserError(f"{path}: {source.uncalibrated()}")
-    if opt.axes != "auto" or source.axes != "unity":  # what was found otherwise, or does not fit
-        print(*(f"{path}: {line}" for line in said), sep="\n", end="\n" if said else "")
+    say([] if how.usual else how.lines, path)
     ticks = ticks[: round(opt.seconds * CONTROL_RATE) if opt.seconds else None]
     return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks])
 

@@ -16,6 +16,7 @@ swings them about a point in front of them.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from dataclasses import dataclass
 from itertools import permutations
@@ -322,12 +323,16 @@ def choose(path, wanted="auto", grip=None, unit=None, order=None, devices=3) -> 
     A live stream cannot be read twice: for it "auto" is Unity's axes, and `Watch` complains as it goes on.  A replay's
     axes are known: Unity's.
     Args      grip, unit, order : what the user gave, or None; they count
-    Test      tests/headset/test_axes.py::test_choose, ::test_told"""
+              devices : of the stream, 1 for the headset alone: controllers that the file has still tell its axes
+    Test      tests/headset/test_axes.py::test_choose, ::test_told, ::test_headset_alone"""
     plain = tuple(order or USUAL)
     if wanted != "auto" and wanted not in AXES:
         raise UserError(f"--axes {wanted}: unknown; valid: auto, {', '.join(AXES)}")
     if is_live(path) or wanted == "auto" and is_replay(path):
         return Choice("unity" if wanted == "auto" else wanted, grip, unit, plain, [])
+    if devices < 3:
+        with contextlib.suppress(UserError):  # it has no controllers, or they cannot be read
+            return choose(path, wanted, grip, unit, plain)
     if wanted == "auto" and (own := axes_in(path, devices)):
         return Choice(own, grip, unit, plain, [f"{OWN} --axes {own}"])
     samples = beginning(path, devices)

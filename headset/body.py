@@ -19,7 +19,7 @@ from headset.reader import Clock, Guard, Sample, files_of, to_world
 from human import SEG, SEGMENTS, SENSOR_OFFSETS, Clip, heading, quat_about, quat_continuous, quat_matrix, quat_rotate
 from mocap.data import CONTROL_RATE
 from mocap.gait import Body, smooth, two_bone_leg
-from plumbing.cli import UserError
+from plumbing.cli import UserError, printable
 
 # ASSUMED, all of it: how a player's body goes with the head
 PELVIS_LAG, YAW_LAG = 0.2, 0.5  # s, standard deviations of the averages that pelvis and trunk follow the head by
@@ -179,7 +179,10 @@ def players(folder) -> list[Clip]:
     out = []
     for file in files_of(folder):
         try:
-            pos, quat = read_recording(file)
+            how = choose(file)
+            pos, quat = read_recording(file, how)
+            for line in [] if how.usual else how.lines:
+                print(printable(f"{file}: {line}"))
             height = standing_height(pos[:, 0])
             if not 1.0 <= height <= 2.1:
                 raise UserError(f"{file}: the headset is {height:.2f} m up; valid: 1.0 to 2.1 m, the floor at 0")

@@ -182,6 +182,16 @@ def test_told(tmp_path):
     assert choose("-", order=(2, 0, 1)).order == (2, 0, 1)
 
 
+def test_headset_alone(tmp_path):
+    """Of a stream that is read for its headset alone the controllers, where there are any, still tell the axes."""
+    path = tmp_path / "u.csv"
+    path.write_text("".join(lines_of_user("openxr")))
+    assert choose(path, devices=1).axes == "openxr" and choose(path, devices=1).order == (0, 1, 2)
+    path.write_text("".join(",".join(line.split(",")[:8]).strip() + "\n" for line in lines_of_user("openxr")))
+    alone = choose(path, devices=1)
+    assert alone.axes == "unity" and "too little" in alone.lines[0] and not alone.usual
+
+
 def test_usual(tmp_path):
     """Nothing need be said of Unity's axes; of all else, and of what is not sure, something."""
     path = tmp_path / "u.csv"

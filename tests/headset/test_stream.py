@@ -20,12 +20,14 @@ import play
 import retarget
 from env import Env, headset_only, observation_terms
 from headset import calibration
+from headset.axes import Watch
 from headset.calibration import Calibration, Resampler, Stream
 from headset.player import Pace, Player, drive, ride
 from headset.reader import (
     AXES,
     COLUMNS,
     DEVICES,
+    GRIP,
     NEUTRAL,
     SEPARATORS,
     UNIT,
@@ -987,21 +989,45 @@ def test_real_recordings(jesse, sensors_dir, name):
     assert np.isfinite(pos).all() and not source.guard.events["head", "teleport"]
 
 
-def test_axes_are_found(jesse, walk, capsys):
-    """A file in Unity's axes is read so by itself, and says so where they are others; a live stream is watched."""
-    from headset import axes
-    from headset.reader import GRIP
+def pointing(clip):
+    """A clip's sensors with controllers that point, as Unity's do: t, pos, quat in our axes."""
+    pos, quat = sensors(clip)
+    quat = quat.copy()
+    quat[:, 1:] = quat_mul(quat[:, 1:], quat_about(1, np.radians(90.0 - GRIP["unity"])))
+    return np.arange(len(pos)) / clip.rate, pos, quat
 
-    pos, quat = sensors(walk)
-    m = AXES["unity"]
-    held = quat.copy()
-    held[:, 1:] = quat_mul(held[:, 1:], quat_about(1, np.radians(90.0 - GRIP["unity"])))
-    vector = np.round(np.linalg.det(m)) * (held[..., 1:] @ m)
-    rows = np.concatenate([vector, held[..., :1]], axis=-1)
-    samples = [Sample(k / walk.rate, pos[k] @ m, rows[k]) for k in range(len(pos))]
-    assert list(play.watched(samples, axes.Watch("unity"))) == samples
+
+def test_axes_are_found(jesse, walk, tmp_path, capsys):
+    """A file is read in its own axes by itself; a live stream is watched, and what does not fit is said."""
+    path = tmp_path / "a.csv"
+    for name in ("unity", "openxr"):
+        path.write_text("".join(to_csv(*pointing(walk), name)))
+        source, how = play.source_of(jesse, path, 3, play.Options())
+        assert (source.axes, source.grip, source.order) == (name, 15.0, [0, 1, 2]) and how.usual == (name == "unity")
+    source, how = play.source_of(jesse, path, 3, play.Options(axes="unity", devices=("head", "right", "left")))
+    assert (source.axes, source.order) == ("unity", [0, 2, 1]) and "--axes auto" in how.lines[0]
+    samples = list(Reader("x").read(to_csv(*pointing(walk), "unity")))
+    assert list(play.watched(samples, Watch("unity"))) == samples
     assert capsys.readouterr().out == ""
-    list(play.watched(samples, axes.Watch("mujoco")))
+    list(play.watched(samples, Watch("mujoco")))
     assert "--axes" in capsys.readouterr().out
-    found = axes.guess(samples)
-    assert found.axes == "unity" and found.order == (0, 1, 2)
+
+
+def test_what_is_said_of_a_folder(jesse, walk, tmp_path, capsys):
+    """Of many recordings a guess is said, with the file's name, unless it is what most files are."""
+    lines = to_csv(*pointing(walk), "unity")
+    headset = [",".join(line.strip().split(",")[:8]) + "\n" for line in lines]
+    still = [lines[0], *(f"{k / 90},{lines[1].split(',', 1)[1]}" for k in range(200))]  # nobody holds the controllers
+    for text, devices, said in (
+        (lines, 3, ""),
+        (lines, 1, ""),
+        (to_csv(*pointing(walk), "openxr"), 3, "--axes openxr"),
+        (["# axes: openxr\n", *to_csv(*pointing(walk), "openxr")], 1, "axes as the file itself says: --axes openxr"),
+        (headset, 1, "too little to tell the axes from: --axes unity"),
+        (still, 3, "not sure"),
+    ):
+        (tmp_path / "a.csv").write_text("".join(text))
+        play.ticks_of(jesse, tmp_path / "a.csv", devices, play.Options())
+        out = capsys.readouterr().out
+        assert out.startswith(f"{tmp_path / 'a.csv'}: ") if said else not out
+        assert said in out and out.count("\n") == bool(said)
