@@ -28,10 +28,11 @@ import numpy as np
 from character import Character, geom_lowest
 from env import BAD, FORCE_LIMIT, SUBSTEPS, fallen, observation_terms, observe, slices_of
 from headset.calibration import Stream
-from headset.reader import Sample
+from headset.reader import FAR_AWAY, Sample
 from human import Clip, heading, place, quat_about, quat_matrix, quat_rotate, sensors
 from mocap.augment import begins_in_motion, lead
 from mocap.data import CONTROL_RATE
+from plumbing.cli import UserError
 from retarget import HEADSET_AHEAD, STAGE_VEL, standing
 
 # ------------------------------------------------------------------------------------ the character
@@ -224,15 +225,19 @@ def _ride(char, act, streams, devices, threads) -> list[Ride]:
     ]
 
 
+FAR = 0.5 * FAR_AWAY  # m: from there nobody walks beyond the Guard's limit in a capture
 STANDS, SETS_OFF, CAPTURE = 1.5, 1.5, 20.0  # s of a streamed capture: still, speeding up, of itself at most
 
 
 def recorded(clip) -> tuple[list[Sample], Clip]:
     """A headset's recording of a clip with its lead-in (`mocap.augment.lead`; no speeding up where it begins still).
 
+    A clip that begins beyond FAR is put on the origin: a headset is where its room is; others stay where they are.
     Returns   samples as a file's reader gives them, axes "mujoco"; the clip with its lead-in
-    Test      tests/test_metrics.py::test_streamed"""
+    Test      tests/test_metrics.py::test_streamed, tests/headset/test_stream.py::test_captures_far_away"""
     whole = clip[: round(CAPTURE * clip.rate) + 1]
+    start = whole.pos[0, 0, :2]
+    whole = place(whole, 0.0, start, np.zeros(2)) if np.abs(start).max() > FAR else whole
     led = lead(whole, STANDS, SETS_OFF if begins_in_motion(whole) else 0.0)
     pos, quat = sensors(led)
     return [Sample(k / clip.rate, pos[k], np.roll(quat[k], -1, axis=-1)) for k in range(len(led))], led
@@ -244,12 +249,15 @@ def stream_of(char: Character, clip, devices=3):
     Method    `recorded` samples through `headset.calibration.Stream`, as a file's are; the calibrating second is not
               played
     Returns   pos (T, 3, 3), quat (T, 3, 4) in the character's world; the clip in the same world, T frames; scale (3,)
-    Test      tests/test_metrics.py::test_streamed
+    Raises    UserError: it shows no headset for a second
+    Test      tests/test_metrics.py::test_streamed, tests/headset/test_stream.py::test_captures_far_away
     """
     stream = Stream(char, "mujoco", rate=clip.rate, devices=devices)
     samples, led = recorded(clip)
     ticks = [tick for sample in samples for tick in stream.push(sample)]
     c = stream.calibration
+    if not ticks:
+        raise UserError(f"{clip.name}: {stream.uncalibrated()}")
     seen = place(led, -c.yaw, c.origin[:2], np.zeros(2))[len(led) - len(ticks) :]
     return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks]), seen, c.scale
 

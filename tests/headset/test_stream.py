@@ -7,6 +7,7 @@ import re
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +23,7 @@ from env import Env, headset_only, observation_terms
 from headset import calibration
 from headset.axes import Watch
 from headset.calibration import Calibration, Resampler, Stream
-from headset.player import Pace, Player, drive, ride
+from headset.player import Pace, Player, drive, ride, stream_of
 from headset.reader import (
     AXES,
     COLUMNS,
@@ -50,6 +51,7 @@ from headset.reader import (
 from human import (
     heading,
     headset_height,
+    place,
     quat_about,
     quat_angle,
     quat_conj,
@@ -795,6 +797,17 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
     with pytest.raises(SystemExit):
         run_main(play.main, [*common, "--stream", str(tmp_path / "none")])
     assert "a folder without recordings" in capsys.readouterr().err
+
+
+def test_captures_far_away(jesse, walk):
+    """A capture that begins 150 m from the origin is as one that does not; a user of 175 m is refused by name."""
+    near, far = (stream_of(jesse, place(walk, 0.0, np.zeros(2), np.array(to))) for to in ([3.0, 0.0], [150.0, -120.0]))
+    for a, b in zip(near[:2] + near[3:], far[:2] + far[3:]):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+    np.testing.assert_allclose(near[2].pos, far[2].pos, atol=1e-9)
+    tall = replace(walk, pos=100.0 * walk.pos, ball=100.0 * walk.ball)
+    with pytest.raises(UserError, match=f"{walk.name}: .* rows show the headset for 0.00 s; .* far away: centimetres"):
+        stream_of(jesse, tall)
 
 
 def test_policy_of_another_character(jesse, tmp_path, capsys, walk):
