@@ -74,7 +74,9 @@ class StreamFlags:
         "auto", "axes of the stream; auto: what fits a person best (a live stream: unity)", choices=("auto", *AXES)
     )
     grip: float | None = arg(
-        None, "how far the fingers point below the controllers' forward axis [degrees]: unity 15, else 90 by default"
+        None,
+        "how far the fingers point below the controllers' forward axis [degrees]: unity 15, else 90 by default",
+        check=(lambda v: -180 <= v <= 180, "from -180 to 180 degrees"),
     )
     stream_unit: float | None = arg(None, "metres a unit of the stream; its axes' own by default", check=POSITIVE)
     devices: tuple[str, ...] | None = arg(
@@ -83,9 +85,15 @@ class StreamFlags:
         "as --axes auto finds them",
         check=(lambda v: sorted(v) == sorted(DEVICES), "head, left and right, each once"),
     )
-    sample_rate: float = arg(SAMPLE_RATE, "rows a second of a stream without times", check=POSITIVE)
+    sample_rate: float | None = arg(
+        None,
+        f"rows a second of a stream without times; {SAMPLE_RATE:g} by default",
+        check=(lambda v: 10 <= v <= 2000, "from 10 to 2000 rows a second"),
+    )
     user_height: float | None = arg(
-        None, "height of the standing user's headset [m]; from the stream's first second by default", check=POSITIVE
+        None,
+        "height of the standing user's headset [m]; from the stream's first second by default",
+        check=(lambda v: 0.3 <= v <= 3, "from 0.3 to 3 m"),
     )
 
 
@@ -546,7 +554,8 @@ def ticks_of(char: Character, path, devices: int, opt: Options):
     if not ticks:
         raise UserError(f"{path}: {source.uncalibrated()}")
     say([] if how.usual else how.lines, path)
-    ticks = ticks[: round(opt.seconds * CONTROL_RATE) if opt.seconds else None]
+    say(source.times(), path)
+    ticks = ticks[: max(1, round(opt.seconds * CONTROL_RATE)) if opt.seconds else None]
     return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks])
 
 

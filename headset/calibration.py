@@ -102,20 +102,21 @@ class Stream:
     """Samples as they come -> poses at the control rate in the character's world.
 
     axes, grip, unit : as `to_world`; order : which of the source's devices are head, left, right
-    sample_rate : of a stream without times [Hz]; user_height : as `calibrate`
+    sample_rate : of a stream without times [Hz], or None for SAMPLE_RATE; user_height : as `calibrate`
     devices     : as `Guard`
     Test          tests/headset/test_stream.py::test_round_trip, test_never_nan
     """
 
     def __init__(
-        self, char, axes="unity", rate=CONTROL_RATE, sample_rate=SAMPLE_RATE, grip=None, user_height=None, devices=3,
+        self, char, axes="unity", rate=CONTROL_RATE, sample_rate=None, grip=None, user_height=None, devices=3,
         unit=None, order=(0, 1, 2),
     ):  # fmt: skip
         if axes not in AXES:
             raise UserError(f"--axes {axes}: unknown; valid: {', '.join(AXES)}")
         self.char, self.axes, self.grip, self.user_height = char, axes, grip, user_height
         self.unit, self.order = unit, list(order)
-        self.clock, self.guard, self.resampler = Clock(sample_rate), Guard(rate, devices), Resampler(rate)
+        self.clock, self.told_rate = Clock(sample_rate or SAMPLE_RATE), sample_rate
+        self.guard, self.resampler = Guard(rate, devices), Resampler(rate)
         self.calibration, self.seen, self.rows = None, [], 0
 
     def push(self, sample: Sample) -> list[Sample]:
@@ -163,6 +164,12 @@ class Stream:
         why = f"; of them {', '.join(bad)}" if bad else ""
         return f"{self.rows} rows show the headset for {self.tracked():.2f} s; {need}{why}"
 
+    def times(self) -> list[str]:
+        """What is to be said of the rows' times.  Test: tests/headset/test_stream.py::test_sample_rate"""
+        if self.rows and not self.clock.timed:
+            return [f"no time column: {self.clock.rate:g} rows a second (--sample-rate)"]
+        return ["the stream has times: --sample-rate is not used"] if self.rows and self.told_rate else []
+
     def report(self) -> list[str]:
         """What was calibrated and what went wrong, for a reader.
 
@@ -174,7 +181,7 @@ class Stream:
                 f"user's headset {c.height:.2f} m above the floor; floor at {c.floor:.2f} m ({how}); "
                 f"forward {np.degrees(c.yaw):.0f} degrees; heights times {c.scale[2]:.3f}"
             )
-        lines += self.guard.report()
+        lines += self.times() + self.guard.report()
         for n, what in (
             (self.clock.dropped, "rows before their predecessor"),
             (self.clock.jumps, "jumps of the clock"),

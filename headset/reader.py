@@ -439,10 +439,12 @@ class Clock:
     def __init__(self, rate=SAMPLE_RATE):
         self.rate, self.last, self.base = rate, None, 0.0
         self.dropped = self.jumps = self.same = 0
+        self.timed = False  # whether a row had a time
         self.forget = False  # the next row tells a new time
 
     def stamp(self, t: float) -> float | None:
         """Seconds since the first row, or None for a row to drop."""
+        self.timed |= bool(np.isfinite(t))
         if self.last is None:
             self.base = -t if np.isfinite(t) else 0.0
             self.last = 0.0

@@ -348,6 +348,24 @@ def test_unordered_times():
     assert [constant.stamp(1.0) for _ in range(200)][-1] > 1.5  # a time column that stands still does not stop time
 
 
+def test_sample_rate(jesse, walk, tmp_path, capsys):
+    """Rows without times are so many a second, which is said; a rate for rows with times is not used, which is, too."""
+    lines, path = to_csv(np.arange(len(walk)) / walk.rate, *sensors(walk)), tmp_path / "a.csv"
+    timeless = [line.split(",", 1)[1] for line in lines]
+    for text, rate, said in (
+        (lines, None, ""),
+        (lines, 30.0, f"{path}: the stream has times: --sample-rate is not used\n"),
+        (timeless, None, f"{path}: no time column: 90 rows a second (--sample-rate)\n"),
+        (timeless, 30.0, f"{path}: no time column: 30 rows a second (--sample-rate)\n"),
+    ):
+        path.write_text("".join(text))
+        pos, _ = play.ticks_of(jesse, path, 3, play.Options(axes="mujoco", grip=90.0, sample_rate=rate))
+        assert capsys.readouterr().out == said
+        assert abs(len(pos) - (len(walk) / (3 if text is timeless and not rate else 1) - 30)) <= 2
+    short, _ = play.ticks_of(jesse, path, 3, play.Options(axes="mujoco", grip=90.0, seconds=0.01))
+    assert len(short) == 1
+
+
 def test_another_clock():
     """One absurd time is one jump there and one back; time goes on by a period."""
     clock = Clock(100)
@@ -907,7 +925,10 @@ def test_command_line(jesse, tmp_path, capsys):
         (("--axes", "blender"), "invalid choice: 'blender'"),
         (("--measure",), "a stream has not"),
         (("--push", "much"), "--push much: valid: N@T"),
-        (("--user-height", 0), "greater than 0"),
+        (("--user-height", 0), "from 0.3 to 3 m"),
+        (("--user-height", 1e9), "from 0.3 to 3 m"),
+        (("--grip", "nan"), "from -180 to 180 degrees"),
+        (("--sample-rate", 1e-3), "from 10 to 2000 rows a second"),
     ):
         assert run(*base, *args) == 2
         assert words in capsys.readouterr().err
