@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import queue
 import re
 import sys
@@ -30,6 +31,7 @@ UNREADABLE_LIMIT = 100  # unreadable lines in a row that end a live stream
 EMPTY = ("", "nan", "null", "none")
 KINDS = (".csv", ".bsor")  # of files; `headset.bsor` reads the other one
 STEPS, JUDGED = (0.0005, 0.1), 11  # s between two rows of a headset; steps by whose median a time column is judged
+COMPRESSED = (b"\x1f\x8b", b"PK\3\4", b"BZh", b"\xfd7zXZ", b"(\xb5/\xfd", b"7z\xbc\xaf")  # gz, zip, bz2, xz, zst, 7z
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}  # which are not ours
 
 # ------------------------------------------------------------------------------------ reading
@@ -157,6 +159,8 @@ class Reader:
         """Samples of an iterable of lines (bytes or text), one by one."""
         for line in lines:
             self.line += 1
+            if self.line == 1 and isinstance(line, bytes) and line.startswith(COMPRESSED):
+                raise UserError(f"{self.name}: is compressed: unpack it; valid: a CSV's lines in UTF-8")
             text = line.decode("utf-8", "replace") if isinstance(line, bytes) else line
             if self.at is None and "\r" in text.strip() and "\0" not in text:
                 raise UserError(f"{self.name}, line {self.line}: line ends of CR alone; valid: LF, or CR and LF")
@@ -301,11 +305,13 @@ def is_live(path) -> bool:
 def files_of(path) -> list[Path]:
     """The recordings (.csv, .bsor) of a folder and below it, perhaps none; or the file itself.
 
+    A link to nothing is among them: who reads it says so.
     Test      tests/headset/test_stream.py::test_folder_of_recordings, tests/headset/test_body.py::test_recordings"""
     path = Path(path)
-    if not path.is_dir():
+    if not os.path.isdir(path):
         return [path]
-    return sorted(f for f in path.rglob("*") if f.suffix.lower() in KINDS and f.is_file())
+    there = lambda f: os.path.isfile(f) or not os.path.exists(f)  # noqa: E731
+    return sorted(f for f in path.rglob("*") if f.suffix.lower() in KINDS and there(f))
 
 
 def lines_of(path):
