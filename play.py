@@ -435,8 +435,8 @@ def follow(char: Character, policy, path, devices: int, opt, see, pace: Pace | N
 
     Args      devices : what the policy was trained with; of 3, two hang beside the body with --sensors hmd
               opt : StreamFlags with `sensors` and `seconds`; see : as `headset.player.drive` has it
-    Raises    UserError: the stream cannot be read, or shows no headset for a second
-    Test      tests/headset/test_stream.py::test_command_line, test_stdin, test_web_view
+    Raises    UserError: the stream cannot be read, or shows no headset for a second; of a live one after the report
+    Test      tests/headset/test_stream.py::test_command_line, test_stdin, test_stdin_that_breaks, test_web_view
     """
     live = is_live(opt.stream)
     read = 1 if opt.sensors == "hmd" else devices
@@ -449,20 +449,30 @@ def follow(char: Character, policy, path, devices: int, opt, see, pace: Pace | N
     say(how.lines)
     if live and pace:
         samples = arriving(samples, GAP, player.dt)
-    with contextlib.suppress(KeyboardInterrupt):  # the end of a live stream; what happened is still told
+    broken = None
+    try:
         drive(source, samples, player, opt.seconds, pace, see)
+    except KeyboardInterrupt:  # the end of a live stream; what happened is still told
+        pass
+    except UserError as error:
+        if not live or source.calibration is None:
+            raise
+        broken = error
     if source.calibration is None:
         raise UserError(f"{reader.name}: {source.uncalibrated()}")
     unreadable = [f"{reader.unreadable} lines could not be read"] if reader.unreadable else []
-    print(*source.report(), *unreadable, *player.report(), *(pace.report() if pace else []), sep="\n")
+    print(*source.report(), *unreadable, *player.report(), *(pace.report() if pace else []), sep="\n", flush=True)
+    if broken:
+        raise broken
 
 
 def play_stream(char: Character, policy, path, devices: int, opt: Options) -> None:
-    """Drive the character with a headset; show it, picture it, write it as BVH.
+    """Drive the character with a headset; show it, picture it, write it as BVH: of a live one also what it broke off.
 
-    Test      tests/headset/test_stream.py::test_command_line, test_stdin, test_web_view, test_stream_as_bvh
+    Test      tests/headset/test_stream.py::test_command_line, test_stdin, test_web_view, test_stream_as_bvh,
+              test_stdin_that_breaks
     """
-    seen, dt = [], 1.0 / CONTROL_RATE
+    seen, dt, live, broken = [], 1.0 / CONTROL_RATE, is_live(opt.stream), None
     keep = KEPT / dt if opt.png or opt.video or opt.bvh else 0
     with contextlib.ExitStack() as stack:
         handle = None
@@ -485,13 +495,20 @@ def play_stream(char: Character, policy, path, devices: int, opt: Options) -> No
                 return handle.is_running()
 
         pace = Pace(dt) if opt.realtime or opt.view else None
-        follow(char, policy, path, devices, opt, see, pace, parse_push(opt.push))
+        try:
+            follow(char, policy, path, devices, opt, see, pace, parse_push(opt.push))
+        except UserError as error:
+            if not live:
+                raise
+            broken = error
     if seen:
         qpos, pos, quat = map(np.array, zip(*seen, strict=True))
         recording = SimpleNamespace(qpos=qpos, frames=np.arange(len(qpos)))
         if opt.bvh:
             opt.write_bvh(char, qpos, CONTROL_RATE)
         _write_pictures(char, SimpleNamespace(sensor_pos=pos, sensor_quat=quat), recording, len(qpos) - 1, opt)
+    if broken:
+        raise broken
 
 
 def _write_pictures(char, ref, recording, last, opt):
@@ -601,18 +618,18 @@ def play_recordings(char: Character, policy, path, devices: int, opt: Options) -
     if not streams:
         raise UserError(broken[0])
     rides = ride(char, policy.mean_action, list(streams.values()), devices, opt.threads)
-    top = Path(opt.stream)
-    names = [str(f.relative_to(top)) if top.is_dir() else f.name for f in streams]
+    top, many = Path(opt.stream), os.path.isdir(opt.stream)
+    names = [str(f.relative_to(top)) if many else f.name for f in streams]
     slides = [slides_of(char, r) for r in rides]
     each = (summary_of([r], [s], read) | {"completed": r.failures == 0} for r, s in zip(rides, slides))
     found = {"files": dict(zip(names, each)), "all": summary_of(rides, slides, read)}
+    if opt.json:
+        atomic_write(opt.json, json.dumps(found, indent=2, allow_nan=False) + "\n")
     for name, ends, row in zip(names, [r.ends for r in rides], found["files"].values()):
-        print(line_of(name, ends, row))
+        print(line_of(printable(name), ends, row))
     ends = sum((r.ends for r in rides), Counter())
     print(line_of(f"all {len(rides)}, completed {found['all']['completed']:.2f}", ends, found["all"]))
     print(*broken, sep="\n", end="\n" if broken else "")
-    if opt.json:
-        atomic_write(opt.json, json.dumps(found, indent=2, allow_nan=False) + "\n")
     return int(bool(broken))
 
 
@@ -657,7 +674,7 @@ def check_options(opt: Options, argv) -> None:
         raise UserError("--measure compares with a human's motion, which a stream has not; give one of the two")
     if opt.json and not (opt.measure or opt.compare or opt.stream):
         raise UserError("--json writes the table of --measure, --compare or --stream: give one of them")
-    many = opt.stream and Path(opt.stream).is_dir()
+    many = opt.stream and os.path.isdir(opt.stream)
     if many and (opt.png or opt.video or opt.bvh or opt.view or opt.realtime or opt.push):
         says = "is a folder, played side by side: leave out pictures, --bvh, --view, --push"
         raise UserError(f"--stream {opt.stream}: {says}")
@@ -702,7 +719,7 @@ def main(argv=None):
     char = metrics.load_character(opt, meta, path)
     if opt.stream:
         devices = metrics.devices_of(meta, path, opt.sensors)
-        if opt.json or Path(opt.stream).is_dir():
+        if opt.json or os.path.isdir(opt.stream):
             code = play_recordings(char, policy, path, devices, opt)
             if not (opt.png or opt.video or opt.bvh or opt.view):
                 return code

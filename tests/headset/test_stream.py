@@ -161,6 +161,7 @@ def test_columns(tmp_path):
         "time,head_px\n": r"f.csv, line 1: no column head_py, .* more; it has time, head_px; valid: .*DEVICE_px",
         ",".join([*COLUMNS, "left_px"]): "column left_px is there twice",
         "": "is empty",
+        b"\x1f\x8b\x08\0\r\xff": "f.csv: is compressed: unpack it; valid",
         "a" * 70000: "longer than 65536 bytes",
         **{
             mark.join(COLUMNS): f"f.csv, line 1: {name} between the columns; valid: commas, and points"
@@ -171,7 +172,7 @@ def test_columns(tmp_path):
         ",".join(COLUMNS) + "\r" + "0," * 40000: "line 1: line ends of CR alone; valid: LF",
     }
     for text, message in cases.items():
-        (tmp_path / "f.csv").write_text(text)
+        (tmp_path / "f.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
         with pytest.raises(UserError, match=message):
             list(Reader("f.csv").read(lines_of(tmp_path / "f.csv")))
     with pytest.raises(UserError, match="no such file; valid"):
@@ -781,20 +782,21 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
     names = ["time", *(f"{d}_{p}" for d in ("head", "left", "right") for p in parts)]
     rows = np.concatenate([pos, np.roll(quat, -1, axis=-1)], axis=-1).reshape(len(pos), -1)
     rows = np.concatenate([np.arange(len(pos))[:, None] / walk.rate, rows], axis=1)
-    (tmp_path / "sub").mkdir()
+    out, tmp_path = tmp_path / "o.json", tmp_path / "in"
+    (tmp_path / "sub").mkdir(parents=True)
     for name, n in (("a.csv", len(rows)), ("sub/b.csv", len(rows) // 2)):
         np.savetxt(tmp_path / name, rows[:n], delimiter=",", header=",".join(names), comments="", fmt="%.9g")
     common = ["--character", "jesse", "--axes", "mujoco"]
 
     def played(path, *more):
         with pytest.raises(SystemExit) as end:
-            run_main(play.main, [*common, "--stream", str(path), "--json", str(tmp_path / "o.json"), *more])
-        return end.value.code, json.loads((tmp_path / "o.json").read_text())
+            run_main(play.main, [*common, "--stream", str(path), "--json", str(out), *more])
+        return end.value.code, json.loads(out.read_text())
 
     code, found = played(tmp_path)
     assert code == 0 and set(found["files"]) == {"a.csv", "sub/b.csv"} and set(found["all"]) == set(play.OF_FILE)
-    out = capsys.readouterr().out.splitlines()
-    assert out[0].startswith("a.csv: ") and out[2].startswith("all 2, completed ")
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].startswith("a.csv: ") and told[2].startswith("all 2, completed ")
     for name, row in found["files"].items():
         assert set(row) == set(play.OF_FILE) and row["completed"] == (row["failures"] == 0)
         code, alone = played(tmp_path / name)
@@ -807,14 +809,21 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
     assert total["failures"] == sum(r["failures"] for r in found["files"].values())
     assert total["completed"] == np.mean([r["completed"] for r in found["files"].values()])
     (tmp_path / "broken.csv").write_text("time,head_px\n0,1\n")
+    (tmp_path / "gone.csv").symlink_to(tmp_path / "nothing")
+    (tmp_path / "sub" / "b.csv").rename(tmp_path / "b\x1b[31m\udcff.csv")
     code, found = played(tmp_path)
-    assert code == 1 and len(found["files"]) == 2 and "broken.csv, line 1: no column" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert code == 1 and len(found["files"]) == 2 and "broken.csv, line 1: no column" in told
+    assert "gone.csv: no such file" in told and "\nb\\x1b[31m\\udcff.csv: " in told
     _, short = played(tmp_path / "a.csv", "--seconds", "1")
     assert short["all"]["seconds"] == 1.0
     (tmp_path / "none").mkdir()
     with pytest.raises(SystemExit):
         run_main(play.main, [*common, "--stream", str(tmp_path / "none")])
     assert "a folder without recordings" in capsys.readouterr().err
+    for more in ([], ["--json", str(out)]):
+        assert run(*common, "--stream", "x" * 300, *more) == 2
+        assert "xxx: File name too long; valid: " in capsys.readouterr().err
 
 
 def test_captures_far_away(jesse, walk):
@@ -962,6 +971,20 @@ def test_stdin(jesse, tmp_path, capsys, monkeypatch):
     assert run("--policy", policy, "--stream", "-", "--axes", "mujoco") == 0
     out = capsys.readouterr().out
     assert "1 lines could not be read" in out and "2.0 s played" in out
+
+
+def test_stdin_that_breaks(jesse, tmp_path, capsys, monkeypatch):
+    """Of a live stream that ends in garbage the seconds played are told and written; then comes the error."""
+    data = "".join([*lines_in_our_axes(), *["garbage\n"] * 200]).encode()
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO(data)))
+    flags = ("--policy", tiny_policy(jesse, tmp_path / "p.npz"), "--axes", "mujoco", "--bvh", tmp_path / "o.bvh")
+    assert run(*flags, "--stream", "-") == 2
+    told = capsys.readouterr()
+    assert "2.0 s played" in told.out and "error: standard input, line 371, column" in told.err
+    assert len(bvh.read(tmp_path / "o.bvh").values) == 60
+    (tmp_path / "s.csv").write_bytes(data)
+    (tmp_path / "o.bvh").unlink()
+    assert run(*flags, "--stream", tmp_path / "s.csv") == 2 and not (tmp_path / "o.bvh").exists()  # a file is mended
 
 
 def test_stdin_that_pauses(jesse):
