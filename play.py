@@ -372,7 +372,7 @@ def play_figure(opt: Options) -> None:
     Test      tests/test_play.py::test_figure"""
     from plumbing import render
 
-    check_folders(opt.png, opt.video, read=mocap.data.parts(opt.motion))
+    check_folders(opt.png, opt.video, read=read_by(opt))
     render.check_video(opt.video)
     _, long = metrics.motion_of(opt)
     clip = chosen(long, opt)
@@ -683,11 +683,21 @@ def check_options(opt: Options, argv) -> None:
     if opt.stream and opt.json and not many and is_live(opt.stream):
         raise UserError("--json tells of recordings, not of a live stream; valid: a .csv or .bsor file, or a folder")
     parse_push(opt.push)
-    check_folders(opt.json, opt.png, opt.video, opt.bvh, read=(*mocap.data.parts(opt.motion), opt.stream, opt.policy))
+    check_folders(opt.json, opt.png, opt.video, opt.bvh, read=read_by(opt))
     if opt.video:
         from plumbing import render
 
         render.check_video(opt.video)
+
+
+def read_by(opt: Options) -> list:
+    """The files and folders that the options have read: motion, stream, policies, the character's own.
+
+    Test      tests/test_play.py::test_what_is_read_is_not_overwritten"""
+    name = Path(opt.character or "jesse")
+    own = name.with_suffix("") if name.suffix == ".toml" else CHARACTERS / name
+    files = [f"{own}{suffix}" for suffix in (".toml", ".xml", ".npz")]
+    return [*mocap.data.parts(opt.motion), opt.joint_map, opt.stream, opt.policy, *opt.compare, *files]
 
 
 def told_life(name, recording) -> str:

@@ -310,6 +310,19 @@ def test_what_cannot_be_done_is_said_first(policy_file, tmp_path):
 # ------------------------------------------------------------------------------------ what the file says
 
 
+def test_what_is_read_is_not_overwritten(policy_file, tmp_path):
+    """The files of a character, its policy found beside it, and a policy that is compared."""
+    for kind in (".toml", ".xml", ".npz"):
+        (tmp_path / f"mine{kind}").touch()
+        for more in (["--stream", __file__], ["--measure"], []):
+            out = str(tmp_path / f"mine{kind}")
+            flag = "--json" if more else "--bvh"
+            with pytest.raises(UserError, match=f"cannot write .*mine{kind}: it is read from"):
+                play.main(["--character", str(tmp_path / "mine.toml"), flag, out, *more])
+    with pytest.raises(UserError, match="cannot write .*p.npz: it is read from"):
+        play.main(["--compare", "x.npz", str(policy_file), "--json", str(policy_file)])
+
+
 def test_character_of_the_policy(char, ref, tmp_path):
     """The policy's own character and variation, unless a flag says something else."""
     meta = {"options": {"character": "oppy", "scale": 0.8, "set": "reward.contact=[0, 1]"}}
