@@ -579,9 +579,12 @@ def ticks_of(char: Character, path, devices: int, opt: Options):
 def slides_of(char: Character, ride) -> np.ndarray:
     """`metrics.own_slide` of a ride, without the jumps to where it was stood up anew.
 
-    Test      tests/headset/test_stream.py::test_folder_of_recordings"""
-    soles = forward_kinematics(char, ride.qpos).soles
-    return np.concatenate([metrics.own_slide(soles[a:b], ride.contact[a:b], CONTROL_RATE) for a, b in ride.lives])
+    As in `metrics.measure` the contact of a life's start is taken to be its first step's.
+    Test      tests/headset/test_stream.py::test_slides_as_measured"""
+    soles, contact = forward_kinematics(char, ride.qpos).soles, ride.contact.copy()
+    for a, b in ride.lives:
+        contact[a] = contact[min(a + 1, b - 1)]
+    return np.concatenate([metrics.own_slide(soles[a:b], contact[a:b], CONTROL_RATE) for a, b in ride.lives])
 
 
 def summary_of(rides, slides, devices: int) -> dict:

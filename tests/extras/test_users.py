@@ -53,7 +53,7 @@ def test_row(clip):
     char, act = character.load("jesse"), lambda obs: np.zeros((len(obs), 33))
     row, other = users.row_of(char, act, [clip], 3, 1), metrics.streamed(char, act, [clip], 3, 1)
     assert row["falls"] + row["lost"] + row["diverged"] == other["failures"] > 0
-    for key in ("completed", "survival", "fails_every_s", "first_failure_s"):
+    for key in ("completed", "survival", "fails_every_s", "first_failure_s", "own_slide_cm_s"):
         assert row[key] == pytest.approx(other[key]), key
     assert row["captures"] == 1 and row["head_cm"] > 5
 

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from test_mocap import walk as make_walk
 
 import character
+import metrics
 import play
 import retarget
 from env import Env, headset_only, observation_terms
@@ -835,6 +836,17 @@ def test_captures_far_away(jesse, walk):
     tall = replace(walk, pos=100.0 * walk.pos, ball=100.0 * walk.ball)
     with pytest.raises(UserError, match=f"{walk.name}: .* rows show the headset for 0.00 s; .* far away: centimetres"):
         stream_of(jesse, tall)
+
+
+def test_slides_as_measured(jesse):
+    """Own slide of a ride is the streamed row's: a character that is stood up does not land."""
+    clip, act = load("standing", clips="stand_005")[0], lambda obs: np.zeros((len(obs), len(jesse.limits)))
+    rides = ride(jesse, act, [stream_of(jesse, clip)[:2]])
+    assert rides[0].failures > 1 and any(rides[0].contact[a + 1].any() for a, _ in rides[0].lives)
+    found = play.summary_of(rides, [play.slides_of(jesse, r) for r in rides], 3)
+    measured = metrics.streamed(jesse, act, [clip])
+    for key in ("head_cm", "hands_cm", "own_slide_cm_s"):
+        assert found[key] == pytest.approx(measured[key], rel=1e-5), key
 
 
 def test_policy_of_another_character(jesse, tmp_path, capsys, walk):
