@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from character import Character
-from headset.reader import AXES, SAMPLE_RATE, Clock, Guard, Sample, blend, to_frame, to_world
+from headset.reader import AXES, GAP, SAMPLE_RATE, Clock, Guard, Sample, blend, to_frame, to_world
 from human import heading, quat_about
 from mocap.data import CONTROL_RATE
 from plumbing.cli import UserError
@@ -43,6 +43,7 @@ class Resampler:
 
 
 CALIBRATION, SEEN = 1.0, 1000  # s of headset; readings kept of it: of a faster stream every other one
+AGAIN = 0.5  # s without a headset, the way back included: it was put on meanwhile, the second begins again.  ASSUMED
 STANDING = (1.0, 2.1)  # m, where the headset of a standing user may be (recorded: 1.37 to 2.00); else no floor at 0
 AVERAGE = 1.64  # m, headset of a user of 1.75 m, taken where the floor is not known.  ASSUMED
 HIPS = 0.554  # of that height: the hips, which a headset does not see, for `scale_z = "hip"`.  ASSUMED
@@ -117,7 +118,7 @@ class Stream:
         self.unit, self.order = unit, list(order)
         self.clock, self.told_rate = Clock(sample_rate or SAMPLE_RATE), sample_rate
         self.guard, self.resampler = Guard(rate, devices), Resampler(rate)
-        self.calibration, self.seen, self.rows = None, [], 0
+        self.calibration, self.seen, self.unseen, self.rows = None, [], 0.0, 0
 
     def push(self, sample: Sample) -> list[Sample]:
         """The ticks that a reading completes; none in the first second, which calibrates."""
@@ -141,6 +142,10 @@ class Stream:
             if self.calibration:
                 ticks += [self.calibration.apply(tick) for tick in self.resampler.push(s)]
             elif self.guard.live():
+                gap = s.t - self.seen[-1][0] if self.seen else 0.0
+                self.unseen += max(0.0, gap - GAP)
+                if gap > AGAIN:
+                    self.seen, self.unseen = [], 0.0
                 self.seen.append((s.t, s.pos[0], s.quat[0]))
                 self.seen = self.seen if len(self.seen) <= SEEN else self.seen[::2]
                 if self.tracked() >= CALIBRATION:
@@ -150,8 +155,10 @@ class Stream:
         return ticks
 
     def tracked(self) -> float:
-        """Seconds of headset seen while calibrating."""
-        return self.seen[-1][0] - self.seen[0][0] if self.seen else 0.0
+        """Seconds of headset seen while calibrating; of the time between two readings GAP at most.
+
+        Test      tests/headset/test_stream.py::test_calibration_of_what_is_seen"""
+        return self.seen[-1][0] - self.seen[0][0] - self.unseen if self.seen else 0.0
 
     def uncalibrated(self) -> str:
         """Why there is no calibration, for a complaint.  Test: tests/headset/test_stream.py::test_no_calibration"""

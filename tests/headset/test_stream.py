@@ -552,6 +552,19 @@ def test_calibration(jesse):
     assert told.height == 1.7 and told.floor == pytest.approx(2.3 - 1.7, abs=0.01)
 
 
+@pytest.mark.parametrize("lost, height, counted", [(0.15, 1.65, 0.6), (2.0, 0.7, 0.0)])
+def test_calibration_of_what_is_seen(jesse, lost, height, counted):
+    """Half a second is seen, then nothing: that time does not count, and after a long one the second begins again."""
+    first, source = standing(0.5, height=height), Stream(jesse, "mujoco")
+    for s in [*first, *(Sample(s.t + first[-1].t + lost, s.pos, s.quat) for s in standing(3.0))]:
+        source.push(Sample(s.t, s.pos, XYZW(s.quat)))
+        if source.calibration:
+            break
+    back = min(0.3, lost) if counted else 0.95 / 2.0  # s: the Guard's way back from where it was held
+    assert s.t - first[-1].t - lost - back == pytest.approx(1.0 - counted, abs=0.05)
+    assert source.calibration.height == pytest.approx(1.65, abs=0.02)
+
+
 def test_calibration_scales_as_training(walk):
     """[root] scale_xy and [sensors] scale_z mean to a stream what they mean to `retarget.sensor_scale`."""
     hips, top = walk.hip_height, headset_height(walk)
