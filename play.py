@@ -52,7 +52,8 @@ from retarget import Reference, forward_kinematics
 
 # flags that say something of a motion alone, or of a stream alone
 OF_MOTION = {"motion", "clips", "joint_map", "unit", "up", "all", "split", "half", "rows", "user_scale"}
-OF_MOTION |= {"random_starts", "sequence", "rate", "floor", "rest_pose"}
+OF_MOTION |= {"random_starts", "sequence", "rate", "floor", "rest_pose", "seed"}
+OF_TABLE = {"half", "rows", "random_starts"}  # of --measure and --compare alone
 OF_STREAM = {"axes", "grip", "stream_unit", "devices", "sample_rate", "user_height", "realtime"}
 
 FIGURES = {  # of the paper: the policies in characters/ that it puts side by side
@@ -103,7 +104,9 @@ class Options(retarget.BvhFlags, StreamFlags, metrics.Options):
 
     measure: bool = arg(False, f"print every metric, a row each of {', '.join(ROWS)} (metrics.py)")
     sequence: int = arg(0, "which sequence to show", check=NONNEGATIVE)
-    seconds: float | None = arg(None, "how much of it to show: 10 s by default, all of a stream", check=POSITIVE)
+    seconds: float | None = arg(
+        None, "how much of it to show: 10 s by default, all of a stream or in a BVH", check=POSITIVE
+    )
     every: float | None = arg(
         None, "seconds between the pictures of the contact sheet: 0.5; with --compare eight pictures", check=POSITIVE
     )
@@ -354,7 +357,7 @@ def figure_options(opt: Options, argv) -> Options:
     Raises    UserError: a policy of it is not there, or flags that would do nothing
     Test      tests/test_play.py::test_figure_options"""
     given = given_flags(argv)
-    may = OF_MOTION - {"rows", "random_starts"} | {"figure", "png", "video", "seconds", "every", "threads", "seed"}
+    may = OF_MOTION - OF_TABLE | {"figure", "png", "video", "seconds", "every", "threads"}
     if wrong := sorted(given - may):
         raise UserError(f"--figure {opt.figure}: has its own policies, streamed: leave out --{', --'.join(wrong)}")
     paths = [Path(os.path.relpath(CHARACTERS / f"{name}.npz")) for name in FIGURES[opt.figure]]
@@ -657,6 +660,21 @@ def check_source(opt: StreamFlags, argv) -> None:
         raise UserError(f"{flags} {says}: leave out the one or the other")
 
 
+def check_given(opt: Options, given) -> None:
+    """UserError: flags that say something of what is not asked for.
+
+    Test      tests/test_play.py::test_flags_of_what_is_not_asked_for"""
+    table = bool(opt.measure or opt.compare)
+    for flags, asked, what in (
+        (OF_TABLE, table, "--measure or --compare"),
+        ({"port"}, opt.view == "web", "--view web"),
+        ({"every"}, opt.png, "--png"),
+    ):
+        if not asked and (wrong := sorted(flags & given)):
+            names = ", ".join(f"--{name.replace('_', '-')}" for name in wrong)
+            raise UserError(f"{names} says something of {what} alone: give that, or leave out {names}")
+
+
 def check_options(opt: Options, argv) -> None:
     """UserError: flags that do not go together.
 
@@ -672,6 +690,7 @@ def check_options(opt: Options, argv) -> None:
         if wrong := [f"--{k}" for k in others if getattr(opt, k) != getattr(plain, k)]:
             raise UserError(f"--compare takes policies with their own characters: leave out {', '.join(wrong)}")
     check_source(opt, argv)
+    check_given(opt, given_flags(argv))
     opt.check_bvh()
     if opt.stream and opt.measure:
         raise UserError("--measure compares with a human's motion, which a stream has not; give one of the two")
@@ -781,7 +800,8 @@ def look(char: Character, policy, path, meta, opt: Options) -> None:
     seen, push = metrics.shown_to(meta, path, ref, opt.sensors), parse_push(opt.push)
     check_fits(policy, Env(char, seen, 1), path)
     if opt.png or opt.video or opt.bvh:
-        last = int((opt.seconds or 10.0) * CONTROL_RATE) if opt.png or opt.video else EPISODE_STEPS
+        told = max(1, round(opt.seconds * CONTROL_RATE)) if opt.seconds else None
+        last = told or (round(10.0 * CONTROL_RATE) if opt.png or opt.video else EPISODE_STEPS)
         shown = min(last, EPISODE_STEPS, len(ref) - 1) / CONTROL_RATE
         if push and push.at >= shown:
             says = f"only {shown:.1f} s are shown: push earlier, or give more --seconds"
@@ -793,7 +813,7 @@ def look(char: Character, policy, path, meta, opt: Options) -> None:
             + (f"; pushed by {push.newtons:g} N at {push.at:g} s" if push and push.at < lived else "")
         )
         if opt.bvh:
-            opt.write_bvh(char, recording.qpos, CONTROL_RATE)
+            opt.write_bvh(char, recording.qpos[: told + 1 if told else None], CONTROL_RATE)
         _write_pictures(char, seen, recording, min(last, len(recording.frames) - 1), opt)
     if opt.view:
         show(char, seen, policy, 0, opt.view, opt.port, push)

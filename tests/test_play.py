@@ -16,7 +16,7 @@ from env import Env, headset_only
 from headset.player import ride, stream_of
 from headset.reader import controllers_hang
 from human import heading
-from mocap import data
+from mocap import bvh, data
 from plumbing import render
 from plumbing.cli import UserError
 from plumbing.runs import save_checkpoint
@@ -321,6 +321,33 @@ def test_what_is_read_is_not_overwritten(policy_file, tmp_path):
                 play.main(["--character", str(tmp_path / "mine.toml"), flag, out, *more])
     with pytest.raises(UserError, match="cannot write .*p.npz: it is read from"):
         play.main(["--compare", "x.npz", str(policy_file), "--json", str(policy_file)])
+
+
+@pytest.mark.parametrize(
+    "flags, says",
+    [
+        ("--png x.png --half report --rows tracked", "--half, --rows says something of --measure or --compare alone"),
+        ("--bvh x.bvh --random-starts 4", "--random-starts says something of --measure or --compare alone"),
+        ("--measure --port 8080", "--port says something of --view web alone"),
+        ("--stream x.csv --port 8080", "--port says something of --view web alone"),
+        ("--stream x.csv --every 1", "--every says something of --png alone"),
+        ("--stream x.csv --seed 1", "--seed are of a motion, and --stream has none"),
+        ("--figure 5 --half report", "--figure 5: has its own policies, streamed: leave out --half"),
+    ],
+)
+def test_flags_of_what_is_not_asked_for(flags, says):
+    """Refused, not passed over."""
+    with pytest.raises(UserError, match=says):
+        play.main(flags.split())
+
+
+def test_seconds_of_a_bvh(policy_file, tmp_path, monkeypatch, char, ref):
+    """All frames, or as many as --seconds says."""
+    monkeypatch.setattr(play, "sequence_of", lambda *_: ref)
+    monkeypatch.setattr(play, "policy_action", lambda _: cheat)
+    for more, frames in ([], 40), (["--seconds", "1"], 31), (["--seconds", "0.01"], 2):
+        play.main(["--policy", str(policy_file), "--bvh", str(tmp_path / "o.bvh"), "--threads", "1", *more])
+        assert len(bvh.read(tmp_path / "o.bvh").values) == frames
 
 
 def test_character_of_the_policy(char, ref, tmp_path):
