@@ -14,7 +14,7 @@ Also known: `t`, `timestamp`; `hmd_`, `headset_`; `left_hand_`, `left_controller
 `nan` or `null` says that the device is not tracked.  Quaternions are x, y, z, w here, w, x, y, z behind `to_world`.
 With the headset alone (`--sensors hmd`, §4.2) the controllers' columns are neither needed nor read.
 
-Nothing here looks ahead, and memory does not grow with the length of a stream.
+Nothing here looks ahead.  `drive` needs no more memory for a longer stream; `ride`, of recordings, keeps every tick.
 """
 
 from __future__ import annotations
