@@ -37,9 +37,10 @@ import retarget
 from character import CHARACTERS, Character
 from env import EPISODE_STEPS, ROOT_LIMIT, Env
 from headset import axes, calibration
+from headset.axes import StreamFlags
 from headset.bsor import opened
 from headset.player import Pace, Player, drive, ride, stream_of
-from headset.reader import AXES, DEVICES, GAP, SAMPLE_RATE, arriving, files_of, is_live
+from headset.reader import DEVICES, GAP, arriving, files_of, is_live
 from human import heading, sensors
 from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_action, simulate
 from mocap.augment import resize
@@ -62,40 +63,6 @@ FIGURES = {  # of the paper: the policies in characters/ that it puts side by si
     8: ("dino", "dino-passive", "dino-fixed"),  # the tail: two joints driven, none driven, six welded
 }
 OF_FIGURE = "completed root_cm head_deg head_wobble_deg_s contact_agreement foot_slide_cm_s steps_per_m".split()
-
-
-@dataclass
-class StreamFlags:
-    """The flags of every command that is driven by a headset: which, and how it is to be read."""
-
-    stream: str | None = arg(
-        None, "drive the character with a headset's .csv file, a .bsor replay, a named pipe, or - for standard input"
-    )
-    axes: str = arg(
-        "auto", "axes of the stream; auto: what fits a person best (a live stream: unity)", choices=("auto", *AXES)
-    )
-    grip: float | None = arg(
-        None,
-        "how far the fingers point below the controllers' forward axis [degrees]: unity 15, else 90 by default",
-        check=(lambda v: -180 <= v <= 180, "from -180 to 180 degrees"),
-    )
-    stream_unit: float | None = arg(None, "metres a unit of the stream; its axes' own by default", check=POSITIVE)
-    devices: tuple[str, ...] | None = arg(
-        None,
-        "which of the stream's devices are head, left and right, as left,head,right; by default as they are named, or "
-        "as --axes auto finds them",
-        check=(lambda v: sorted(v) == sorted(DEVICES), "head, left and right, each once"),
-    )
-    sample_rate: float | None = arg(
-        None,
-        f"rows a second of a stream without times; {SAMPLE_RATE:g} by default",
-        check=(lambda v: 10 <= v <= 2000, "from 10 to 2000 rows a second"),
-    )
-    user_height: float | None = arg(
-        None,
-        "height of the standing user's headset [m]; from the stream's first second by default",
-        check=(lambda v: 0.3 <= v <= 3, "from 0.3 to 3 m"),
-    )
 
 
 @dataclass

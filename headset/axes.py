@@ -25,9 +25,9 @@ from typing import NamedTuple
 import numpy as np
 
 from headset.bsor import is_replay, opened
-from headset.reader import AXES, DEVICES, GRIP, UNIT, Sample, is_live, to_world
+from headset.reader import AXES, DEVICES, GRIP, SAMPLE_RATE, UNIT, Sample, is_live, to_world
 from human import heading, quat_matrix, quat_rotate
-from plumbing.cli import UserError
+from plumbing.cli import POSITIVE, UserError, arg
 
 SECONDS = (1.0, 11.0)  # of headset: when a stream is judged, and again
 LONG = 60.0  # s of a file in whose first eleven both controllers lie still
@@ -47,6 +47,40 @@ OTHER_GRIP = 0.3  # what it costs that a controller is not held as these axes' o
 GRIP_OFF = 45.0  # degrees from a forearm to where the grip says that the fingers are
 USUAL = (0, 1, 2)  # order of the devices: head, left, right
 FOUND, OWN = "axes found from head, hands and forearms:", "axes as the file itself says:"
+
+
+@dataclass
+class StreamFlags:
+    """The flags of every command that is driven by a headset: which, and how it is to be read."""
+
+    stream: str | None = arg(
+        None, "drive the character with a headset's .csv file, a .bsor replay, a named pipe, or - for standard input"
+    )
+    axes: str = arg(
+        "auto", "axes of the stream; auto: what fits a person best (a live stream: unity)", choices=("auto", *AXES)
+    )
+    grip: float | None = arg(
+        None,
+        "how far the fingers point below the controllers' forward axis [degrees]: unity 15, else 90 by default",
+        check=(lambda v: -180 <= v <= 180, "from -180 to 180 degrees"),
+    )
+    stream_unit: float | None = arg(None, "metres a unit of the stream; its axes' own by default", check=POSITIVE)
+    devices: tuple[str, ...] | None = arg(
+        None,
+        "which of the stream's devices are head, left and right, as left,head,right; by default as they are named, or "
+        "as --axes auto finds them",
+        check=(lambda v: sorted(v) == sorted(DEVICES), "head, left and right, each once"),
+    )
+    sample_rate: float | None = arg(
+        None,
+        f"rows a second of a stream without times; {SAMPLE_RATE:g} by default",
+        check=(lambda v: 10 <= v <= 2000, "from 10 to 2000 rows a second"),
+    )
+    user_height: float | None = arg(
+        None,
+        "height of the standing user's headset [m]; from the stream's first second by default",
+        check=(lambda v: 0.3 <= v <= 3, "from 0.3 to 3 m"),
+    )
 
 
 @dataclass(frozen=True)
