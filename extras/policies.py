@@ -85,6 +85,49 @@ def each_once(licences) -> str:
     return "; ".join(t for t in terms if not (t.endswith(data.UNKNOWN) and t.split(", licensed: ")[0] in known))
 
 
+def pairs_of(experts) -> list[tuple[str, str]]:
+    """PATTERN=POLICY, … of `extras.teacher`, each parted; the policy is "" where there is none.
+
+    Test      tests/extras/test_policies.py::test_ship"""
+    parted = [str(one).partition("=") for one in experts or ()]
+    return [(pattern, path) for pattern, _, path in parted]
+
+
+def sets_of(options) -> list[str]:
+    """The data sets of a run: its motions and its players."""
+    return data.parts(str(options["motion"])) + ([str(options["players"])] if options.get("players") else [])
+
+
+def licences_of(meta, path, way=()) -> list[str]:
+    """The terms of a policy's weights, none for MIT: its own licence; without one, those of its data sets and of the
+    policies that it began from and copied.
+
+    Args      path : of the policy, for the message; way : the files that led here, so that a circle ends
+    Test      tests/extras/test_policies.py::test_licences_of_ancestors"""
+    if "licence" in meta:  # was shipped before
+        return [str(meta["licence"])] if meta["licence"] != "MIT" else []
+    name = Path(path).name
+    try:
+        options = meta["options"]
+        out = [TRAINED + text for text in data.licences(sets_of(options))]
+        ancestors = [options.get("init"), *(file for _, file in pairs_of(options.get("expert")))]
+    except (KeyError, TypeError, AttributeError, UserError):
+        return [f"{TRAINED}what {name} was, licensed: unknown: {name} is gone, or does not say"]
+    for file in filter(None, ancestors):
+        where = Path(str(file)).resolve()
+        its = {} if where in way else meta_of(where)  # in a circle one was replaced
+        out += licences_of(its, where, (*way, where))
+    return out
+
+
+def meta_of(path) -> dict:
+    """What a policy's file says; {} if it cannot be read."""
+    try:
+        return load_policy(path)[1]
+    except UserError:
+        return {}
+
+
 def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     """Write a run's policy for others to play: weights, normaliser, how it was trained, its data's licence.
 
@@ -105,25 +148,21 @@ def ship(run, path, blend=(), share=0.5, gain=1.0) -> dict:
     except ValueError as e:
         raise UserError(f"blend {run} {' '.join(map(str, blend))}: {e}; valid: policies of one ancestor") from None
     try:
-        motion, _, _, _ = str(meta["options"]["motion"]), meta["options"]["init"], meta["steps"], meta["data"]
+        sets, _, _, _ = sets_of(meta["options"]), meta["options"]["init"], meta["steps"], meta["data"]
     except (KeyError, TypeError) as e:
         raise UserError(f"{run}: does not say how it was trained ({e}); valid: a folder that ppo.py wrote") from None
-    sets = data.parts(motion)
-    sets += [str(meta["options"]["players"])] if meta["options"].get("players") else []
-    licences = [TRAINED + text for text in data.licences(sets)]
-    if "licence" in meta:  # was shipped before
-        licences = [str(meta["licence"])] if meta["licence"] != "MIT" else []
+    licences = licences_of(meta, run)
+    for p, (_, its) in zip(blend, loaded, strict=True):
+        licences += licences_of(its, p)
     kept = {"policy": meta["policy"], "steps": total_steps(meta), "data": meta["data"]}
     kept["options"] = meta["options"] | {"motion": ",".join(map(data.set_name, sets)), "out": None, "init": None}
     kept["options"] |= {"players": None}  # among the motions now
-    if experts := meta["options"].get("expert"):  # PATTERN=FILE: its name, no folder of this machine
-        pairs = [str(one).partition("=") for one in experts]
-        kept["options"]["expert"] = [f"{pattern}={Path(file).name}" for pattern, _, file in pairs]
+    if experts := pairs_of(meta["options"].get("expert")):  # a policy's name, no folder of this machine
+        kept["options"]["expert"] = [f"{pattern}={Path(file).name}" for pattern, file in experts]
     policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})
     kept |= {"gain": gain} if gain != 1.0 else {}
     if blend:
         kept["blend"] = {"with": [Path(p).name for p in blend], "share": share}
-        licences += [str(m["licence"]) for _, m in loaded if m.get("licence", "MIT") != "MIT"]
     kept |= {"licence": each_once(licences) or "MIT", "versions": versions(), "git": git_state()}
     save_checkpoint(path, policy.arrays(), kept)
     return kept
@@ -289,7 +328,8 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
     )
     options = meta.get("options", {}) | {"sensors": sensors, "without": list(opt.without)}
     options |= {"hidden": list(policy.hidden), "value_hidden": list(policy.value_hidden), "init": None, "out": None}
-    kept = {k: meta[k] for k in ("data", "licence", "blend", "gain") if k in meta}
+    kept = {k: meta[k] for k in ("data", "blend", "gain") if k in meta}
+    kept["licence"] = each_once(licences_of(meta, path)) or "MIT"  # what it began from is not named any more
     kept |= {"policy": policy.shape(), "options": options, "steps": total_steps(meta), "carried": Path(path).name}
     return policy, kept | {"versions": versions(), "git": git_state()}
 

@@ -41,6 +41,7 @@ import ppo
 from character import Character, driven_groups
 from env import Env
 from extras import train
+from extras.policies import pairs_of
 from nn import clip_grad_norm
 from plumbing.cli import POSITIVE, UserError, arg, run_main
 from plumbing.training import progress_line, read_options
@@ -123,12 +124,11 @@ def experts(asked, env: Env) -> tuple[list, np.ndarray]:
     Raises    UserError: not PATTERN=POLICY, no sequence of that name, or a policy of another body
     Test      tests/extras/test_teacher.py::test_experts"""
     policies, whose = [], np.full(len(env.ref.names), -1)
-    for k, one in enumerate(asked):
-        pattern, _, path = one.partition("=")
+    for k, (pattern, path) in enumerate(pairs_of(asked)):
         fits = np.array([fnmatchcase(name, pattern) for name in env.ref.names])
         if not (path and fits.any()):
             names = ", ".join(env.ref.names[:6])
-            raise UserError(f"--expert {one}: valid: PATTERN=POLICY, the pattern of sequences such as {names}")
+            raise UserError(f"--expert {asked[k]}: valid: PATTERN=POLICY, the pattern of sequences such as {names}")
         policy, _ = load_policy(path)
         check_fits(policy, env, path)
         policies.append(policy)

@@ -147,8 +147,8 @@ CMU = "free to use, credit CMU Graphics Lab Motion Capture Database (mocap.cs.cm
 
 
 def licences(sets) -> list[str]:
-    """Of each data set that is not built in: its name, and the first line of the licence file in it, or above its part;
-    of a folder without one whose name begins with `cmu`, the credit that CMU asks for.
+    """Of each data set that is not built in: its name, and the first lines of the licence files in it and above its
+    part; of a folder without one whose name begins with `cmu`, the credit that CMU asks for.
 
     Test      tests/mocap/test_mocap.py::test_licences, tests/extras/test_policies.py::test_ship
     """
@@ -157,9 +157,8 @@ def licences(sets) -> list[str]:
         whole = path.parent if path.name in ("train", "validation") else path
         notes = [note for folder in (path, whole) if folder.is_dir() for note in sorted(folder.glob("LICENSE*"))]
         absent = CMU if whole.name.lower().startswith("cmu") else UNKNOWN
-        text = notes[0].read_text(errors="replace") if notes else absent
-        title = text.strip().split("\n")[0]
-        out.append(f"{set_name(path)}, licensed: {title}")
+        titles = [note.read_text(errors="replace").strip().split("\n")[0] for note in notes] or [absent]
+        out.append(f"{set_name(path)}, licensed: {', '.join(dict.fromkeys(titles))}")
     return out
 
 

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 
+from mocap.data import CMU
 from plumbing.cli import UserError
 from plumbing.files import atomic_write
 
@@ -82,9 +83,8 @@ DATASETS = {
         ("*.bvh",),
     ),
     "cmu": DataSet(
-        "free to use, credit asked for (CMU Graphics Lab Motion Capture Database)",
-        "The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from "
-        "NSF EIA-0196217.",
+        CMU,
+        "The data used in this project was obtained from mocap.cs.cmu.edu.",  # whose funding the credit names
         tuple(_cmu()),
     ),
 }  # fmt: skip

@@ -53,6 +53,43 @@ def test_ship(tmp_path, monkeypatch):
         policies.ship(tmp_path / "nothing", target)
 
 
+def kept(path, **meta):
+    """A policy's file that says of itself what it is told to; the same weights each time."""
+    policy = Policy(3, 3, 2, (4,), (4,), 0.1, 1.0, np.random.default_rng(0))
+    path.parent.mkdir(exist_ok=True)
+    save_checkpoint(path, policy.arrays(), {"policy": policy.shape()} | meta)
+    return str(path)
+
+
+def run_on(path, motion="builtin", init=None, **options):
+    return kept(path, options={"motion": str(motion), "init": init} | options, steps=16, data={})
+
+
+def test_licences_of_ancestors(tmp_path):
+    """What a policy began from, what it copied and what it is averaged with keep their terms, at any distance; what is
+    gone is said."""
+    (tmp_path / "m").mkdir()
+    (tmp_path / "m" / "LICENSE").write_text("Non-commercial.")
+    line, out = "weights trained on m, licensed: Non-commercial.", tmp_path / "out.npz"
+    terms = lambda *args: policies.ship(*args)["licence"]  # noqa: E731
+    shipped, mine = kept(tmp_path / "s.npz", licence=line), kept(tmp_path / "free.npz", licence="MIT")
+    run = run_on(tmp_path / "run" / CHECKPOINT, tmp_path / "m")
+    first = run_on(tmp_path / "a.npz", init=str(tmp_path / "run"))
+    for path in (run, first, run_on(tmp_path / "b.npz", init=first), run_on(tmp_path / "c.npz", init=shipped)):
+        assert terms(path, out) == line
+    expert = (f"back_*={mine}",)
+    assert terms(run_on(tmp_path / "d.npz", init=mine, expert=expert), out) == "MIT"
+    assert policies.pairs_of(["a=b=c", "d"]) == [("a", "b=c"), ("d", "")]
+    assert terms(run_on(tmp_path / "e.npz", init=mine, expert=(*expert, f"*={first}")), out) == line
+    assert terms(mine := run_on(tmp_path / "f.npz"), out) == "MIT"
+    assert terms(mine, out, [mine, tmp_path / "run"]) == line
+    gone = run_on(tmp_path / "g.npz", init=str(tmp_path / "old" / "x.npz"))
+    said = "weights trained on what x.npz was, licensed: unknown: x.npz is gone, or does not say"
+    assert terms(gone, out) == terms(mine, out, [gone, gone]) == said
+    again = tmp_path / "x.npz"
+    assert terms(run_on(again, init=str(again)), out) == said  # replaced by its own descendant
+
+
 def test_each_once():
     """An average of averages names a set once, and by its terms where one of them knew them."""
     a, b, unknown = "a, licensed: X; or Y", "b, licensed: Z", f"a, licensed: {data.UNKNOWN}"
@@ -294,6 +331,12 @@ def test_carry_command(tmp_path, capsys):
     np.testing.assert_allclose(b.log_std, a.log_std + np.log(0.5), rtol=1e-5)
     assert meta["options"]["set"] == "reward.contact=[0.5, 1.0]" and meta["options"]["character"] == "dino"
     assert (b.hidden, b.value_hidden, meta["carried"], meta["steps"]) == ((12,), (6,), "p.npz", 5)
+    assert meta["licence"] == "MIT"
+    saved(tmp_path, dino, init=str(character.CHARACTERS / "dino.npz"))  # not named by what is carried: its terms are
+    policies.main(args)
+    terms = load_policy(character.CHARACTERS / "dino.npz")[1]["licence"]
+    assert load_policy(out)[1]["licence"] == terms
+    saved(tmp_path, dino, set="reward.contact=[0.5, 1.0]")
     policies.main(["carry", str(path), str(out), "--tail", "passive", "--set", ""])
     _, meta = load_policy(out)
     assert meta["options"]["tail"] == "passive" and not meta["options"]["set"] and meta["policy"]["action_size"] == 33

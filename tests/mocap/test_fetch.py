@@ -12,6 +12,7 @@ from dataclasses import replace
 import pytest
 
 from mocap import fetch
+from mocap.data import CMU
 from mocap.fetch import DATASETS, DataSet
 from plumbing.cli import UserError
 
@@ -263,3 +264,4 @@ def test_data_sets_say_their_terms():
     for d in DATASETS.values():
         assert isinstance(d, DataSet) and d.licence and d.citation and d.files
         assert all(url.startswith(("https://github.com/", "http://mocap.cs.cmu.edu/")) for _, url, _ in d.files)
+    assert DATASETS["cmu"].licence == CMU  # what a policy carries, fetched or not

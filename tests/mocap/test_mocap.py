@@ -818,6 +818,9 @@ def test_licences(tmp_path):
     assert data.licences(["builtin", "standing"]) == []
     (tmp_path / "a" / "train").mkdir()
     assert data.licences([tmp_path / "a" / "train"]) == ["a/train, licensed: Non-commercial."]
+    for name, text in (("LICENSE-x", "MIT License"), ("LICENSE-y", "MIT License\nmore"), ("LICENSE-z", "BSD")):
+        (tmp_path / "a" / name).write_text(text)
+    assert data.licences([tmp_path / "a" / "train"]) == ["a/train, licensed: MIT License, BSD, Non-commercial."]
     credited = [f"{name}, licensed: {data.CMU}" for name in ("cmu-inplace/train", "cmu")]
     assert data.licences(["/x/cmu-inplace/train", "/x/cmu"]) == credited
     assert data.set_name(tmp_path / "a" / "train") == "a/train" and data.set_name("builtin") == "builtin"
