@@ -660,8 +660,8 @@ def run(opt: Options) -> None:
 
     Test      tests/test_play.py::test_measure_json, test_largest_push"""
     push = parse_push(opt.push)
-    check_folders(opt.json, read=(*mocap.data.parts(opt.motion), opt.policy))
     policy, path, meta = find_policy(opt)
+    check_folders(opt.json, read=(*mocap.data.parts(opt.motion), path))
     char, devices = load_character(opt, meta, path), devices_of(meta, path, opt.sensors)
     captures, long = motion_of(opt)
     ref = reference(char, long)
@@ -759,7 +759,7 @@ def run_comparison(opt: Options) -> tuple[list[Arm], list]:
 
     Test      tests/test_play.py::test_compare"""
     check_comparison(opt)
-    check_folders(opt.json, read=mocap.data.parts(opt.motion))
+    check_folders(opt.json, read=(*mocap.data.parts(opt.motion), *opt.compare))
     captures, long = motion_of(opt)
     arms = arms_of(long, opt)
     print(*(a.title() for a in arms), sep="\n")

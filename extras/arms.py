@@ -408,7 +408,8 @@ def main(argv=None):
         raise UserError(f"{', '.join(odd)}: no such arm; valid: {', '.join(ARMS)}")
     if wrong := sorted(given_flags(flags) - (RUN if what == "run" else TABLE)):
         raise UserError(f"--{', --'.join(wrong)} would do nothing for {what}: leave it out")
-    check_folders(opt.json, opt.png, read=data.parts(opt.motion))
+    read = *data.parts(opt.motion), opt.bodies, *(folder_of(name, opt) for name in ARMS)
+    check_folders(opt.json, opt.png, read=read)
     if what == "run":
         run(list(dict.fromkeys(names)), opt)
         return

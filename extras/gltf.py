@@ -332,7 +332,7 @@ def main(argv=None) -> None:
     out = Path(opt.out or f"{char.name}.glb")
     if out.suffix.lower() != ".glb":
         raise UserError(f"--out {out}: is written as .glb; give a name that ends so")
-    check_folders(out, read=(*mocap.data.parts(opt.motion), opt.stream, opt.policy))
+    check_folders(out, read=(*mocap.data.parts(opt.motion), opt.stream, path))
     qpos = recorded(char, policy, path, meta, opt)
     notes = {"character": char.name, "policy": Path(path).name, "licence": str(meta.get("licence", "not said"))}
     data = gltf_of(char, qpos, CONTROL_RATE, notes)

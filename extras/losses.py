@@ -35,7 +35,7 @@ from headset.bsor import opened
 from headset.calibration import HIPS, Stream
 from headset.player import Player, recorded, ride
 from headset.reader import SAMPLE_RATE, Sample
-from mocap.data import CONTROL_RATE, MotionFlags, load
+from mocap.data import CONTROL_RATE, MotionFlags, load, parts
 from mocap.rigs import Reading
 from play import recordings_of
 from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cell, cli, markdown, run_main
@@ -161,27 +161,29 @@ def user_scale(char, height) -> np.ndarray:
 
 
 def cast_of(opt: Options) -> dict:
-    """name -> character, policy, devices.  UserError: no such character, no policy, or one that does not fit"""
+    """name -> character, policy, devices, path.  UserError: no such character, no policy, or one that does not fit"""
     out = {}
     for name in opt.characters:
         flags = metrics.Options(character=name)
         own, path, meta = policy.find_policy(flags)
         char, devices = policy.load_character(flags, meta, path), policy.devices_of(meta, path, None)
         policy.check_fits(own, Player(char, own.mean_action, devices=devices), path)
-        out[char.name] = char, own, devices
+        out[char.name] = char, own, devices, path
     return out
 
 
-def measured(opt: Options) -> dict:
+def measured(opt: Options, cast) -> dict:
     """set -> loss -> character -> completed (a share), failures, fails_every_s (None: never).
 
+    Args      cast : of `cast_of`
+
     Test      tests/extras/test_loss_table.py::test_table"""
-    cast, found, kinds = cast_of(opt), {}, rows()
+    found, kinds = {}, rows()
     first = next(iter(cast.values()))[0]
     for title, takes in captures(opt).items():
         found[title] = {loss.name: {} for loss in kinds}
         seen = [streams_of(first, take, opt.seed) for take in takes]
-        for name, (char, own, devices) in cast.items():
+        for name, (char, own, devices, _) in cast.items():
             streams = []
             for each, height in seen:  # another character's stream differs by its scale alone
                 ratio = user_scale(char, height) / user_scale(first, height)
@@ -219,8 +221,9 @@ def table(found: dict) -> str:
 def main(argv=None) -> int:
     """Print the tables.  Test: tests/extras/test_loss_table.py::test_table"""
     opt = cli(Options, argv, "python -m extras.losses", __doc__)
-    check_folders(opt.json, read=[opt.stream])
-    found = measured(opt)
+    cast = cast_of(opt)
+    check_folders(opt.json, read=(opt.stream, *parts(opt.motion), *(path for *_, path in cast.values())))
+    found = measured(opt, cast)
     for title, rows_ in found.items():
         n = next(iter(next(iter(rows_.values())).values()))["captures"]
         print(f"{title}: {n} captures\n\n{table(rows_)}\n")

@@ -401,7 +401,7 @@ def main(argv=None):
     if what == "ship" and "share" in given_flags(flags):
         raise UserError("--share is of blend OUT.npz A B …: leave it out")
     run, out, *others = files if what == "ship" else [files[1], files[0], *files[2:]]
-    check_folders(out)
+    check_folders(out, read=[run, *others])
     meta = ship(run, out, others, opt.share, opt.gain)
     mixed = f", {1 - opt.share:g} of it and {opt.share:g} of {', '.join(others)}" if others else ""
     print(f"{out}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}{mixed}; {meta['licence']}")

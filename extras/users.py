@@ -126,14 +126,14 @@ COLUMNS = {
 def main(argv=None):
     """Print the table.  Test: tests/extras/test_users.py::test_command"""
     opt = cli(Options, list(argv or []), "extras.users", __doc__)
-    check_folders(opt.json, read=parts(opt.motion))
+    policies = [find_policy(metrics.Options(character=name)) for name in opt.characters]
+    check_folders(opt.json, read=(*parts(opt.motion), *(path for _, path, _ in policies)))
     asked = {f.name: getattr(opt, f.name) for f in fields(metrics.MotionFlags)}
     captures, _ = metrics.motion_of(metrics.Options(**asked, split=opt.split, half=opt.half))
     print(markdown([["", *(k.replace("_", " ") for k in COLUMNS)]]), flush=True)
     out = {}
-    for name in opt.characters:
+    for name, (policy, path, meta) in zip(opt.characters, policies, strict=True):
         own = metrics.Options(character=name)
-        policy, path, meta = find_policy(own)
         char, devices = load_character(own, meta, path), devices_of(meta, path, None)
         check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
         for title, played_by in users(opt).items():

@@ -136,7 +136,10 @@ def parts(motion) -> list[str]:
     """The data sets of a --motion: one, or several with commas between them (unless a file has that name).
 
     Test      tests/mocap/test_mocap.py::test_joined"""
-    sets = str(motion).split(",") if not Path(motion).exists() else [str(motion)]
+    try:
+        sets = [str(motion)] if Path(motion).exists() else str(motion).split(",")
+    except OSError:  # too long for a name
+        sets = str(motion).split(",")
     if "" in sets:
         raise UserError(f"--motion {motion}: an empty name, a comma too many; valid: {MOTION}")
     return sets

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import difflib
+import errno
 import os
 import sys
 import types
@@ -35,7 +36,8 @@ def printable(text) -> str:
 
 
 def run_main(main_fn, argv=None):
-    """Call main_fn(argv), then exit: its own int; 2 and one line for a UserError or too little memory; 130 on Ctrl-C.
+    """Call main_fn(argv), then exit: its own int; 2 and one line for a UserError, too little memory or a name of a
+    file that no system takes; 130 on Ctrl-C.
 
     Test      tests/plumbing/test_runs.py::test_run_main
     """
@@ -50,6 +52,11 @@ def run_main(main_fn, argv=None):
         code = 2
     except MemoryError as error:
         print(f"error: not enough memory: {printable(str(error))[:MESSAGE]}; give smaller numbers", file=sys.stderr)
+        code = 2
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:  # any other is for whoever opens the file
+            raise
+        print(f"error: {printable(str(error.filename))[:60]}…: {error.strerror}; give a shorter one", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

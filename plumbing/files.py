@@ -26,6 +26,9 @@ import numpy as np
 
 from plumbing.cli import UserError
 
+CHECKPOINT, PREVIOUS, CONFIG, METRICS = "checkpoint.npz", "checkpoint.prev.npz", "config.json", "metrics.csv"
+RUN = CHECKPOINT, PREVIOUS, CONFIG, METRICS  # what a run writes into its folder
+
 # ---- files that are whole or absent ---------------------------------------------------------------------------------
 
 
@@ -73,19 +76,32 @@ def check_folders(*paths, read=()) -> None:
     """Before the slow work: the files to write, None left out, have a folder and destroy nothing.
 
     Args      read : files and folders that are read, None left out
-    Raises    UserError: no such folder; the file is one of those read, or motion in a folder of them; it is read-only
+    Raises    UserError: no such folder; the file is a folder, one of those read, or there in a folder of them (of a
+              run's, only what the run wrote); it is read-only, or no name of a file
     Test      tests/robustness/test_cli.py::test_folder_to_write, test_nothing_read_is_overwritten
     """
     for out in filter(None, paths):
         file = Path(out).resolve()
+        try:
+            mode = file.stat().st_mode if file.exists() else None
+        except OSError as error:
+            raise UserError(f"cannot write {out}: {error.strerror}; give another file") from None
         if not file.parent.is_dir():
             raise UserError(f"cannot write {out}: there is no folder {Path(out).parent}")
-        for source in (Path(s).resolve() for s in read if s):
-            inside = source in file.parents and source.is_dir() and file.suffix.lower() in (".bvh", ".amc", ".asf")
-            if file == source or (inside and file.exists()):
-                raise UserError(f"cannot write {out}: it is read from; give another file")
-        if file.is_file() and not file.stat().st_mode & 0o222:
+        if any(_is_read(file, Path(source).resolve()) for source in read if source):
+            raise UserError(f"cannot write {out}: it is read from, or in a folder that is; give another file")
+        if mode and stat.S_ISDIR(mode):
+            raise UserError(f"cannot write {out}: it is a folder; give a file")
+        if mode and stat.S_ISREG(mode) and not mode & 0o222:
             raise UserError(f"cannot write {out}: it is read-only; give another file")
+
+
+def _is_read(file, source) -> bool:
+    """Whether a file is one that is read, or is there in a folder that is: of a run's folder, what the run wrote."""
+    if file == source or source not in file.parents or not file.exists():
+        return file == source
+    is_run = any((source / name).exists() for name in RUN)
+    return not is_run or (file.parent == source and file.name in RUN)
 
 
 def make_folder(path) -> None:

@@ -33,9 +33,19 @@ from pathlib import Path
 import numpy as np
 
 from plumbing.cli import UserError
-from plumbing.files import atomic_write, parse_json, parse_number, read_arrays, read_text, twice
-
-CHECKPOINT, PREVIOUS, CONFIG, METRICS = "checkpoint.npz", "checkpoint.prev.npz", "config.json", "metrics.csv"
+from plumbing.files import (
+    CHECKPOINT,
+    CONFIG,
+    METRICS,
+    PREVIOUS,
+    RUN,
+    atomic_write,
+    parse_json,
+    parse_number,
+    read_arrays,
+    read_text,
+    twice,
+)
 
 
 class StopFlag:
@@ -98,7 +108,7 @@ def check_run(out, resume=False):
     Test      tests/plumbing/test_runs.py::test_open_run, tests/robustness/test_fuzz.py::test_run_folders
     """
     out = Path(out)
-    there = any((out / name).exists() for name in (CONFIG, CHECKPOINT, PREVIOUS, METRICS))
+    there = any((out / name).exists() for name in RUN)
     if there and not resume:
         go_on = "" if resume is None else "add --resume to continue it, or "
         raise UserError(f"{out} already holds a run: {go_on}choose another folder")

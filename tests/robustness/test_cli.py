@@ -18,22 +18,25 @@ from test_mocap import walk, write_as
 from test_rigs import write_rig
 
 import character
+import metrics
 import mocap.data
 import play
 import ppo
 import retarget
 from env import Env
+from extras import losses, policies, users
 from mocap import __main__ as mocap_command
 from mocap import bvh
 from mocap.data import load
 from plumbing import render
 from plumbing.cli import UserError, run_main
-from plumbing.files import make_folder
+from plumbing.files import check_folders, make_folder
 from plumbing.runs import CHECKPOINT, CONFIG, METRICS, load_checkpoint, read_metrics, save_checkpoint
 from policy import Policy, load_policy
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = {"mocap": mocap_command, "retarget": retarget, "ppo": ppo, "play": play}
+OTHERS = {"metrics": metrics, "policies": policies, "losses": losses, "users": users}
 RUNS = ("retarget", "ppo", "play")
 TINY = "--recipe none --clips *stand* --envs 4 --horizon 4 --steps 16 --hidden 8 --value-hidden 8 --threads 1".split()
 
@@ -48,7 +51,7 @@ def here(tmp_path, monkeypatch):
 def run(script, *args):
     """The exit code of `python SCRIPT.py ARGS`, run in this process; anything but SystemExit is a traceback."""
     with pytest.raises(SystemExit) as end:
-        run_main(SCRIPTS[script].main, [str(a) for a in args])
+        run_main((SCRIPTS | OTHERS)[script].main, [str(a) for a in args])
     return end.value.code
 
 
@@ -252,6 +255,52 @@ def test_nothing_read_is_overwritten(here, capsys):
     assert own.read_text() == "a motion" and other.read_text() == "a picture"
 
 
+def test_outputs_that_are_inputs(here, capsys):
+    """Files that are read and what is there in folders that are stay; a run's folder takes pictures and tables."""
+    takes, run_folder = here / "takes", here / "run"
+    for file in (takes / "a.csv", run_folder / CHECKPOINT, run_folder / CONFIG, run_folder / "t.json", here / "t.json"):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("mine")
+    a, b, own = small_policy(here / "a.npz"), small_policy(here / "b.npz"), run_folder / CHECKPOINT
+    (here / "own.npz").symlink_to(a)
+    for script, *flags, out in (
+        ("metrics", "--compare", a, b, "--json", a),
+        ("metrics", "--policy", a, "--json", here / "own.npz"),
+        ("policies", "ship", a, a),
+        ("policies", "ship", run_folder, own),
+        ("policies", "blend", a, b, a),
+        ("losses", "--characters", "jesse", "--stream", takes, "--json", takes / "a.csv"),
+        ("losses", "--characters", "jesse", "--motion", takes, "--json", takes / "a.csv"),
+        ("losses", "--characters", "jesse", "--json", character.CHARACTERS / "jesse.npz"),
+        ("users", "--characters", "jesse", "--json", character.CHARACTERS / "jesse.npz"),
+    ):
+        assert f"cannot write {out}: it is read from" in refuse(capsys, here, script, *flags, out), flags
+    check_folders(run_folder / "t.json", here / "t.json", takes / "new.csv", None, read=[takes, run_folder, None])
+    for out in (own, run_folder / CONFIG):
+        with pytest.raises(UserError, match="it is read from"):
+            check_folders(out, read=[run_folder])
+    for script in ("metrics", "losses"):
+        assert f"cannot write {takes}: it is a folder; give a file" in refuse(capsys, here, script, "--json", takes)
+
+
+def test_names_too_long(here, capsys):
+    """A name that no system takes is one line, wherever it is given; data sets are parted however many they are."""
+    long = 300 * "x"
+    for script, *flags in (
+        ("metrics", "--motion", long),
+        ("metrics", "--policy", long),
+        ("metrics", "--character", long),
+        ("metrics", "--json", long),
+        ("play", "--png", f"{long}.png"),
+        ("mocap", "inspect", long),
+        ("losses", "--characters", "jesse", "--stream", long),
+        ("policies", "ship", long, "y.npz"),
+        ("ppo", "--out", long),
+    ):
+        assert "File name too long" in refuse(capsys, here, script, *flags), flags
+    assert mocap.data.parts(",".join(["builtin"] * 50)) == ["builtin"] * 50
+
+
 @pytest.mark.parametrize("script", RUNS)
 def test_no_clip_matches(script, here, capsys):
     more = ["--measure", "--policy", small_policy(here / "p.npz")] if script == "play" else []
@@ -304,8 +353,7 @@ def test_broken_run_folder(here, capsys):
 
 def test_mocap_inspect(tmp_path):
     path = write_as(tmp_path / "walk_001.bvh", "bandai", walk(1.0, 60.0))
-    done = subprocess.run([sys.executable, "-m", "mocap", "inspect", path], cwd=ROOT, capture_output=True,
-    text=True)
+    done = subprocess.run([sys.executable, "-m", "mocap", "inspect", path], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0 and done.stderr == ""
     first, *_, last = done.stdout.splitlines()
     assert first == f"{path}: rig bandai, {len(done.stdout.splitlines()) - 2} joints"
