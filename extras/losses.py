@@ -110,31 +110,52 @@ class Capture:
         return Capture(self.name, self.samples[: int(np.searchsorted(t, t[0] + seconds))], self.how)
 
 
-def captures(opt: Options) -> dict[str, list[Capture]]:
-    """The sets: clips of the validation part with their lead-in, and recordings.
+def sound(read, items) -> tuple[list, list[str]]:
+    """`read` of every item, and what is said of those that it cannot: they are left out.
+
+    Raises    UserError: that of the first, where none can be read
+    Test      tests/extras/test_loss_table.py::test_a_broken_recording"""
+    out, broken = [], []
+    for item in items:
+        try:
+            out.append(read(item))
+        except UserError as error:
+            broken.append(str(error))
+    if broken and not out:
+        raise UserError(broken[0])
+    return out, broken
+
+
+def captures(opt: Options) -> tuple[dict[str, list[Capture]], list[str]]:
+    """The sets: clips of the validation part with their lead-in, and recordings.  -> sets, lines on broken files
 
     Raises    UserError: nothing there
     Test      tests/extras/test_loss_table.py::test_table"""
     clips = load(opt.motion, clips=opt.clips, split="validation", reading=Reading.of(opt))
-    out = {opt.motion: []}
+    out, broken = {opt.motion: []}, []
     for clip in sorted(clips, key=lambda c: c.name)[: opt.most]:
         samples, _ = recorded(clip)
         out[opt.motion].append(Capture(clip.name, samples, {"axes": "mujoco", "rate": clip.rate}).cut(opt.seconds))
     if opt.stream:
         files = recordings_of(opt.stream)[: opt.most]
-        out[Path(opt.stream).name or opt.stream] = [recording(file, opt.seconds) for file in files]
-    return out
+        takes, broken = sound(lambda file: recording(file, opt.seconds), files)
+        out[Path(opt.stream).name or opt.stream] = takes
+    return out, broken
 
 
 def recording(file, seconds) -> Capture:
-    """The first seconds of a file; its axes as they fit best."""
+    """The first seconds of a file; its axes as they fit best.
+
+    Test      tests/extras/test_loss_table.py::test_seconds_without_times"""
     how, samples, first = choose(file), [], None
     for sample in opened(file)[1]:
         first = sample.t if first is None else first
         if sample.t - first > seconds or len(samples) > 1000 * seconds:
             break
         samples.append(sample)
-    return Capture(file.name, samples, {"axes": how.axes, "grip": how.grip, "unit": how.unit, "order": how.order})
+    reading = {"axes": how.axes, "grip": how.grip, "unit": how.unit, "order": how.order}
+    take = Capture(file.name, samples, reading)
+    return take if np.isfinite([s.t for s in samples]).all() else take.cut(seconds)
 
 
 def streams_of(char, capture: Capture, seed: int):
@@ -172,17 +193,19 @@ def cast_of(opt: Options) -> dict:
     return out
 
 
-def measured(opt: Options, cast) -> dict:
-    """set -> loss -> character -> completed (a share), failures, fails_every_s (None: never).
+def measured(opt: Options, cast) -> tuple[dict, list[str]]:
+    """set -> loss -> character -> completed (a share), failures, fails_every_s (None: never); lines on broken captures.
 
     Args      cast : of `cast_of`
 
     Test      tests/extras/test_loss_table.py::test_table"""
     found, kinds = {}, rows()
     first = next(iter(cast.values()))[0]
-    for title, takes in captures(opt).items():
+    sets, broken = captures(opt)
+    for title, takes in sets.items():
         found[title] = {loss.name: {} for loss in kinds}
-        seen = [streams_of(first, take, opt.seed) for take in takes]
+        seen, odd = sound(lambda take: streams_of(first, take, opt.seed), takes)
+        broken += odd
         for name, (char, own, devices, _) in cast.items():
             streams = []
             for each, height in seen:  # another character's stream differs by its scale alone
@@ -191,7 +214,7 @@ def measured(opt: Options, cast) -> dict:
             rides = ride(char, own.mean_action, streams, devices, opt.threads)
             for k, loss in enumerate(kinds):
                 found[title][loss.name][name] = summary(rides[k :: len(kinds)])
-    return found
+    return found, broken
 
 
 def summary(rides) -> dict:
@@ -219,17 +242,20 @@ def table(found: dict) -> str:
 
 
 def main(argv=None) -> int:
-    """Print the tables.  Test: tests/extras/test_loss_table.py::test_table"""
+    """Print the tables.  -> exit status, 1 if a recording could not be read
+
+    Test      tests/extras/test_loss_table.py::test_table, test_a_broken_recording"""
     opt = cli(Options, argv, "python -m extras.losses", __doc__)
     cast = cast_of(opt)
     check_folders(opt.json, read=(opt.stream, *parts(opt.motion), *(path for *_, path in cast.values())))
-    found = measured(opt, cast)
+    found, broken = measured(opt, cast)
+    if opt.json:  # first: whoever reads what is printed may not read to its end
+        atomic_write(opt.json, json.dumps(found, indent=2, allow_nan=False) + "\n")
     for title, rows_ in found.items():
         n = next(iter(next(iter(rows_.values())).values()))["captures"]
         print(f"{title}: {n} captures\n\n{table(rows_)}\n")
-    if opt.json:
-        atomic_write(opt.json, json.dumps(found, indent=2, allow_nan=False) + "\n")
-    return 0
+    print(*broken, sep="\n", end="\n" if broken else "")
+    return int(bool(broken))
 
 
 if __name__ == "__main__":

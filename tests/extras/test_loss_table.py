@@ -8,7 +8,7 @@ from test_stream import standing, to_csv
 
 import character
 from extras import losses
-from headset.reader import Reader
+from headset.reader import SAMPLE_RATE, Reader
 from plumbing.cli import UserError, run_main
 
 
@@ -74,3 +74,31 @@ def test_table(tmp_path, capsys):
     with pytest.raises(SystemExit):
         run_main(losses.main, [*flags[:6], "--stream", str(tmp_path / "none")])
     assert "a folder without recordings" in capsys.readouterr().err
+
+
+def test_a_broken_recording(tmp_path, monkeypatch, capsys):
+    """It is named and left out, and so is one that is too short to calibrate; the tables are written all the same."""
+    whole = "".join(to_csv(*zip(*standing(3.0, 30.0)), "unity"))
+    (tmp_path / "bad.csv").write_text("no recording")
+    (tmp_path / "good.csv").write_text(whole)
+    (tmp_path / "short.csv").write_text("".join(whole.splitlines(keepends=True)[:20]))
+    monkeypatch.setattr(losses, "rows", lambda: [losses.Loss()])
+    flags = ["--characters", "jesse", "--most", "3", "--seconds", "3", "--threads", "1", "--clips", "walk_105"]
+    assert losses.main([*flags, "--stream", str(tmp_path), "--json", str(tmp_path / "o.json")]) == 1
+    *_, bad, short = capsys.readouterr().out.splitlines()
+    assert "bad.csv" in bad and "short.csv" in short
+    assert json.loads((tmp_path / "o.json").read_text())[tmp_path.name]["nothing"]["jesse"]["captures"] == 1
+    (tmp_path / "good.csv").unlink()
+    (tmp_path / "short.csv").unlink()
+    with pytest.raises(UserError, match="bad.csv"):
+        losses.main([*flags, "--stream", str(tmp_path)])
+
+
+def test_seconds_without_times(tmp_path):
+    """A file without times is cut by its rows, one with times where it was."""
+    t, pos, quat = zip(*standing(4.0, 60.0))
+    lines = "".join(to_csv(t, pos, quat, "unity")).splitlines()
+    for name, first, want in (("with", 0, 121), ("without", 1, 2 * SAMPLE_RATE)):
+        file = tmp_path / f"{name}.csv"
+        file.write_text("\n".join(",".join(line.split(",")[first:]) for line in lines) + "\n")
+        assert len(losses.recording(file, 2.0).samples) == want
