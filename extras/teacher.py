@@ -44,7 +44,7 @@ from extras import train
 from extras.policies import pairs_of
 from nn import clip_grad_norm
 from plumbing.cli import POSITIVE, UserError, arg, run_main
-from plumbing.training import progress_line, read_options
+from plumbing.training import given_names, progress_line, read_options
 from policy import check_fits, load_policy, widths
 
 RATE, DAMPING = 6.0, 0.7  # rad/s and of critical damping, ASSUMED: of the teacher's arms, spring included
@@ -205,6 +205,10 @@ def main(argv=None):
     opt = read_options(Options, argv, "extras.teacher", __doc__, widths)
     if not (opt.init or opt.resume):
         raise UserError("--init: a teacher needs a student that walks; valid: a policy's .npz or a run folder")
+    if opt.gpu:
+        raise UserError("--gpu: a student copies on the processor alone: leave it out")
+    if opt.expert and "joints" in given_names(argv):
+        raise UserError("--joints: beside --expert no joints are taught: leave out one of the two")
     ppo.train(opt, train.make_env(opt), trainer=Student)
 
 

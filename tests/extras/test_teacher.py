@@ -169,8 +169,15 @@ def test_resume_is_exact(start, tmp_path):
     assert_same_run(tmp_path / "whole", tmp_path / "a")
 
 
-def test_command(tmp_path, capsys):
-    """Without a student it says what it needs, in one line."""
+def test_command(start, tmp_path, capsys):
+    """Without a student it says what it needs, in one line; so it does of flags that would do nothing."""
     with pytest.raises(SystemExit):
         run_main(teacher.main, [*TINY, "--out", str(tmp_path / "a")])
     assert "--init: a teacher needs a student" in capsys.readouterr().err
+    for flags, says in (
+        (["--gpu"], "--gpu: a student copies on the processor"),
+        (["--expert", "*=x.npz", "--joints", "tail"], "--joints: beside --expert no joints are taught"),
+    ):
+        with pytest.raises(SystemExit):
+            run_main(teacher.main, [*TINY, "--init", str(start), *flags, "--out", str(tmp_path / "a")])
+        assert says in capsys.readouterr().err
