@@ -41,7 +41,7 @@ from mocap import yardsticks
 from mocap.augment import resize
 from mocap.data import MotionFlags
 from mocap.rigs import Reading
-from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cell, cli, markdown, run_main
+from plumbing.cli import NONNEGATIVE, THREADS, UserError, arg, cell, cli, markdown, run_main
 from plumbing.files import atomic_write, check_folders
 from plumbing.runs import fmt_count
 from policy import check_fits, devices_of, find_policy, load_character, load_policy, sensors_of, total_steps
@@ -566,6 +566,7 @@ def shown_to(meta, path, ref: Reference, sensors: str | None) -> Reference:
 # ------------------------------------------------------------------------------------ measuring
 
 MOST = 96  # captures of a streamed row, evenly chosen
+TIMES = (lambda v: 0.3 <= v <= 2, "from 0.3 to 2 times the recorded person's height")
 
 
 @dataclass
@@ -590,11 +591,12 @@ class Options(MotionFlags, Switches):
     )
     half: str = arg(
         "both",
-        "of the part: select, every other clip, on which policies are chosen; report, the rest; or both",
+        "which captures of the row streamed; the other rows are of the whole part: select, every other one by name of "
+        "those that --clips leaves, on which policies are chosen; report, the rest; or both",
         choices=tuple(HALVES),
     )
     rows: tuple[str, ...] = arg(ROWS, f"rows of the table, of {', '.join(ROWS)}", metavar="NAME,…")
-    user_scale: float = arg(1.0, "play the motion by a user this many times as tall", check=POSITIVE)
+    user_scale: float = arg(1.0, "play the motion by a user this many times as tall", check=TIMES)
     random_starts: int = arg(
         256, "characters started at random frames for the time to failure (0: leave it out)", check=NONNEGATIVE
     )
@@ -610,15 +612,19 @@ class Options(MotionFlags, Switches):
 def motion_of(opt: Options) -> tuple[list, list]:
     """The captures for the streamed row, and the stitched sequences for all others.
 
-    ASSUMED   at most MOST captures, evenly chosen; a half is every other one by name
+    ASSUMED   at most MOST captures, evenly chosen; a half is every other one by name, of those that --clips leaves:
+              with other --clips a capture can be in the other half
+    Raises    UserError: no such row; a half without captures
     Test      tests/test_metrics.py::test_halves"""
     if wrong := set(opt.rows) - set(ROWS):
         raise UserError(f"--rows {','.join(sorted(wrong))}: unknown; valid: {', '.join(ROWS)}")
     split, reading = "all" if opt.all else opt.split, Reading.of(opt)
     single = mocap.data.load(opt.motion, clips=opt.clips, split=split, reading=reading)
-    single = sorted(single, key=lambda c: c.name)[HALVES[opt.half]]
-    many = len(single)
-    single = [single[i] for i in np.unique(np.linspace(0, many - 1, min(many, MOST)).round().astype(int))]
+    half = sorted(single, key=lambda c: c.name)[HALVES[opt.half]]
+    if not half and "streamed" in opt.rows:
+        raise UserError(f"--half {opt.half}: none of the {len(single)} captures; valid: both, select")
+    many = len(half)
+    single = [half[i] for i in np.unique(np.linspace(0, many - 1, min(many, MOST)).round().astype(int))]
     long = mocap.data.sequences(opt.motion, split, opt.clips, seed=opt.seed, reading=reading)
     if opt.user_scale != 1.0:
         single, long = ([resize(c, opt.user_scale) for c in clips] for clips in (single, long))
@@ -669,7 +675,7 @@ def run(opt: Options) -> None:
     check_fits(policy, Env(char, seen, 1), path)
     if push:
         found = largest_push(char, seen, policy_action(policy), push.at, push.newtons, threads=opt.threads)
-        print(push_report(found, push))
+        printed = push_report(found, push)
         lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in found.items()}
         text = json.dumps(lists, indent=2) + "\n"
     else:
@@ -677,10 +683,10 @@ def run(opt: Options) -> None:
         results = measure_all(char, ref, policy, opt, seen, () if hang else captures, devices)
         if not results:
             raise UserError("--rows streamed: there is none with controllers that hang; leave out --sensors hmd")
-        print(report(results))
-        text = as_json(results)
-    if opt.json:
+        printed, text = report(results), as_json(results)
+    if opt.json:  # first: whoever reads what is printed may not read to its end
         atomic_write(opt.json, text)
+    print(printed)
 
 
 # ------------------------------------------------------------------------------------ comparing
@@ -764,9 +770,9 @@ def run_comparison(opt: Options) -> tuple[list[Arm], list]:
     arms = arms_of(long, opt)
     print(*(a.title() for a in arms), sep="\n")
     results = compare(arms, opt, captures)
-    print(report(results, comparison))
     if opt.json:
         atomic_write(opt.json, as_json(results))
+    print(report(results, comparison))
     return arms, long
 
 

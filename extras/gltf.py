@@ -23,7 +23,7 @@ import play
 from character import Character, Switches
 from env import EPISODE_STEPS, SENSORS, Env
 from human import quat_conj, quat_continuous, quat_mul, quat_rotate
-from metrics import policy_action, shown_to, simulate
+from metrics import TIMES, policy_action, shown_to, simulate
 from mocap.data import CONTROL_RATE, MotionFlags
 from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cli, run_main
 from plumbing.files import atomic_write, check_folders
@@ -46,7 +46,7 @@ class Options(play.StreamFlags, MotionFlags, Switches):
     sequence: int = arg(0, "which sequence of the motion", check=NONNEGATIVE)
     all: bool = arg(False, "every sequence of the motion, not only its validation part")
     split: str = arg("validation", "which part of the motion", choices=("train", "validation", "style", "body"))
-    user_scale: float = arg(1.0, "play the motion by a user this many times as tall", check=POSITIVE)
+    user_scale: float = arg(1.0, "play the motion by a user this many times as tall", check=TIMES)
     seconds: float | None = arg(None, "how much of it; all by default", check=POSITIVE)
     seed: int = arg(0, "seed of stitching", check=NONNEGATIVE)
     threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)

@@ -27,7 +27,7 @@ from human import SENSOR_OFFSETS, headset_height
 from mocap.augment import resize
 from mocap.data import CONTROL_RATE, parts
 from play import slides_of
-from plumbing.cli import ALL_POSITIVE, THREADS, arg, cell, cli, markdown, run_main
+from plumbing.cli import THREADS, UserError, arg, cell, cli, given_flags, markdown, run_main
 from plumbing.files import atomic_write, check_folders
 from policy import check_fits, devices_of, find_policy, load_character
 
@@ -39,6 +39,7 @@ BUILDS = {  # ASSUMED: trunk and arms in proportion to the legs, as times the re
     "short arms": (1.0, 0.85),
 }
 MIDDLE = 1.75  # m: at other heights the arms are as recorded
+STATURES = (lambda v: v and all(0.5 <= x <= 2.5 for x in v), "one or more statures from 0.5 to 2.5 metres, as 1.6,1.9")
 
 
 @dataclass
@@ -48,10 +49,10 @@ class Options(metrics.MotionFlags):
     characters: tuple[str, ...] = arg(
         ("jesse", "oppy", "dino"), "names or .toml paths, the .npz beside it", check=(len, "one or more names")
     )
-    heights: tuple[float, ...] = arg((1.45, 1.6, MIDDLE, 1.9, 2.0), "statures of the users [m]", check=ALL_POSITIVE)
+    heights: tuple[float, ...] = arg((1.45, 1.6, MIDDLE, 1.9, 2.0), "statures of the users [m]", check=STATURES)
     as_is: bool = arg(False, "the users as they were recorded, one row")
     split: str = arg("validation", "which part", choices=("train", "validation", "style", "body"))
-    half: str = arg("report", "of the part: select, report, or both", choices=tuple(metrics.HALVES))
+    half: str = arg("report", "which captures, as metrics.py: select, report, both", choices=tuple(metrics.HALVES))
     json: str | None = arg(None, "write the table here")
     threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
 
@@ -125,7 +126,10 @@ COLUMNS = {
 
 def main(argv=None):
     """Print the table.  Test: tests/extras/test_users.py::test_command"""
-    opt = cli(Options, list(argv or []), "extras.users", __doc__)
+    argv = list(argv or [])
+    opt = cli(Options, argv, "extras.users", __doc__)
+    if opt.as_is and "heights" in given_flags(argv):
+        raise UserError("--as-is leaves the users' heights as they are: leave out --heights, or --as-is")
     policies = [find_policy(metrics.Options(character=name)) for name in opt.characters]
     check_folders(opt.json, read=(*parts(opt.motion), *(path for _, path, _ in policies)))
     asked = {f.name: getattr(opt, f.name) for f in fields(metrics.MotionFlags)}

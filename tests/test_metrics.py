@@ -659,6 +659,10 @@ def test_halves(ref):
     assert sorted(names["select"] + names["report"]) == sorted(names["both"]) and len(names["both"]) == 12
     with pytest.raises(UserError, match="--rows oracle: unknown; valid: streamed, tracked"):
         metrics.motion_of(metrics.Options(rows=("oracle",)))
+    one = metrics.Options(clips="walk_105", half="report")
+    with pytest.raises(UserError, match="--half report: none of the 1 captures; valid: both, select"):
+        metrics.motion_of(one)
+    assert metrics.motion_of(replace(one, rows=("tracked",)))[0] == []  # a half is of the streamed row
 
 
 def test_command(tmp_path, capsys, monkeypatch):
@@ -670,3 +674,16 @@ def test_command(tmp_path, capsys, monkeypatch):
     rows = json.loads((tmp_path / "t.json").read_text())
     assert list(rows) == ["streamed", "kinematic"] and rows["streamed"]["clips"] == 1
     assert "| streamed |" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        metrics.main(["--user-scale", "175"])
+    assert "from 0.3 to 2 times" in capsys.readouterr().err
+
+    def closed(*_, file=None, **__):
+        if file is None:
+            raise BrokenPipeError
+
+    (tmp_path / "t.json").unlink()
+    monkeypatch.setattr(metrics, "print", closed, raising=False)
+    with pytest.raises(BrokenPipeError):  # as in `… | head`: the table is written
+        metrics.main(["--character", "jesse", *more])
+    assert json.loads((tmp_path / "t.json").read_text()) == rows

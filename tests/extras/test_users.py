@@ -71,3 +71,11 @@ def test_command(clip, tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         run_main(users.main, ["--clips", "swim*"])
     assert "no clip matches 'swim*'" in capsys.readouterr().err
+    for flags, says in (
+        ("--heights 175", "from 0.5 to 2.5 metres"),
+        ("--as-is --heights 1.6", "leave out --heights, or --as-is"),
+        ("--clips walk_105", "--half report: none of the 1 captures; valid: both, select"),
+    ):
+        with pytest.raises(SystemExit):
+            run_main(users.main, ["--characters", "jesse", *flags.split()])
+        assert says in capsys.readouterr().err
