@@ -28,6 +28,7 @@ from plumbing.cli import UserError
 
 CHECKPOINT, PREVIOUS, CONFIG, METRICS = "checkpoint.npz", "checkpoint.prev.npz", "config.json", "metrics.csv"
 RUN = CHECKPOINT, PREVIOUS, CONFIG, METRICS  # what a run writes into its folder
+WRITTEN = (".json", ".png", ".mp4")  # tables and pictures: nothing reads them from a folder, but a run its config.json
 
 # ---- files that are whole or absent ---------------------------------------------------------------------------------
 
@@ -76,8 +77,8 @@ def check_folders(*paths, read=()) -> None:
     """Before the slow work: the files to write, None left out, have a folder and destroy nothing.
 
     Args      read : files and folders that are read, None left out
-    Raises    UserError: no such folder; the file is a folder, one of those read, or there in a folder of them (of a
-              run's, only what the run wrote); it is read-only, or no name of a file
+    Raises    UserError: no such folder; the file is a folder, one of those read, or there in a folder of them; it is
+              read-only, or no name of a file
     Test      tests/robustness/test_cli.py::test_folder_to_write, test_nothing_read_is_overwritten
     """
     for out in filter(None, paths):
@@ -97,11 +98,12 @@ def check_folders(*paths, read=()) -> None:
 
 
 def _is_read(file, source) -> bool:
-    """Whether a file is one that is read, or is there in a folder that is: of a run's folder, what the run wrote."""
+    """Whether a file is one that is read, or is there in a folder that is: of a run's folder, what the run wrote; of
+    any other all but tables and pictures, which are written there again and again."""
     if file == source or source not in file.parents or not file.exists():
         return file == source
     is_run = any((source / name).exists() for name in RUN)
-    return not is_run or (file.parent == source and file.name in RUN)
+    return file.name in RUN or not (is_run or file.suffix.lower() in WRITTEN)
 
 
 def make_folder(path) -> None:

@@ -275,7 +275,10 @@ def test_outputs_that_are_inputs(here, capsys):
         ("users", "--characters", "jesse", "--json", character.CHARACTERS / "jesse.npz"),
     ):
         assert f"cannot write {out}: it is read from" in refuse(capsys, here, script, *flags, out), flags
-    check_folders(run_folder / "t.json", here / "t.json", takes / "new.csv", None, read=[takes, run_folder, None])
+    (run_folder / "p.npz").write_text("mine")
+    written = run_folder / "t.json", run_folder / "p.npz", here / "t.json", takes / "new.csv", None
+    check_folders(*written, read=[takes, run_folder, None])
+    check_folders(here / "t.json", read=[here])  # once more
     for out in (own, run_folder / CONFIG):
         with pytest.raises(UserError, match="it is read from"):
             check_folders(out, read=[run_folder])
