@@ -621,7 +621,7 @@ def motion_of(opt: Options) -> tuple[list, list]:
     split, reading = "all" if opt.all else opt.split, Reading.of(opt)
     single = mocap.data.load(opt.motion, clips=opt.clips, split=split, reading=reading)
     half = sorted(single, key=lambda c: c.name)[HALVES[opt.half]]
-    if not half and "streamed" in opt.rows:
+    if single and not half and "streamed" in opt.rows:
         raise UserError(f"--half {opt.half}: none of the {len(single)} captures; valid: both, select")
     many = len(half)
     single = [half[i] for i in np.unique(np.linspace(0, many - 1, min(many, MOST)).round().astype(int))]
