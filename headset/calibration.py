@@ -43,7 +43,7 @@ class Resampler:
 
 
 CALIBRATION, SEEN = 1.0, 1000  # s of headset; readings kept of it: of a faster stream every other one
-AGAIN = 0.5  # s without a headset, the way back included: it was put on meanwhile, and the second begins again
+AGAIN = 0.5  # s without a headset, the way back included: put on meanwhile, so the second begins again.  ASSUMED
 STANDING = (1.0, 2.1)  # m, where the headset of a standing user may be (recorded: 1.37 to 2.00); else no floor at 0
 AVERAGE = 1.64  # m, headset of a user of 1.75 m, taken where the floor is not known.  ASSUMED
 HIPS = 0.554  # of that height: the hips, which a headset does not see, for `scale_z = "hip"`.  ASSUMED

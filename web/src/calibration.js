@@ -1,13 +1,14 @@
 // Samples of any rate -> poses at 30 Hz in the character's world: twins of headset/calibration.py and of
 // retarget.root_scale, sensor_scale, standing.
 
-import { AXES, Clock, Guard, SAMPLE_RATE, UserError, blend, toFrame, toWorld } from './reader.js';
+import { AXES, Clock, GAP, Guard, SAMPLE_RATE, UserError, blend, toFrame, toWorld } from './reader.js';
 import { heading, quatAbout, quatMul, quatRotate } from './human.js';
 
 export const CONTROL_RATE = 30;
 export const CALIBRATION = 1.0; // s of headset
 const SEEN = 1000; // readings kept of it
-const STANDING = [1.0, 1.9]; // m, where the headset of a standing user may be; otherwise the floor is not at height 0
+const AGAIN = 0.5; // s without a headset: it was put on meanwhile, and the second begins again.  ASSUMED
+const STANDING = [1.0, 2.1]; // m, where the headset of a standing user may be; otherwise the floor is not at height 0
 const AVERAGE = 1.64; // m, headset of a user of 1.75 m, taken where the floor is not known.  ASSUMED
 const HIPS = 0.554; // of that height: the hips.  ASSUMED
 export const HEADSET_AHEAD = [0.14, 0, 0]; // retarget.HEADSET_AHEAD [m]
@@ -97,7 +98,7 @@ export class Stream { // calibration.Stream
     this.clock = new Clock(sampleRate);
     this.guard = new Guard(CONTROL_RATE, devices);
     this.resampler = new Resampler();
-    [this.calibration, this.seen, this.rows] = [null, [], 0];
+    [this.calibration, this.seen, this.unseen, this.rows] = [null, [], 0, 0];
   }
 
   push(sample) {
@@ -120,6 +121,9 @@ export class Stream { // calibration.Stream
       if (this.calibration) {
         for (const tick of this.resampler.push(s)) ticks.push(this.calibration.apply(tick));
       } else if (this.guard.live()) {
+        const gap = this.seen.length ? s.t - this.seen.at(-1).t : 0;
+        this.unseen += Math.max(0, gap - GAP);
+        if (gap > AGAIN) [this.seen, this.unseen] = [[], 0];
         this.seen.push(s);
         if (this.seen.length > SEEN) this.seen = this.seen.filter((_, i) => i % 2 === 0);
         if (this.tracked() >= CALIBRATION) {
@@ -132,8 +136,8 @@ export class Stream { // calibration.Stream
     return ticks;
   }
 
-  tracked() { // seconds of headset seen while calibrating
-    return this.seen.length ? this.seen.at(-1).t - this.seen[0].t : 0;
+  tracked() { // seconds of headset seen while calibrating; of the time between two readings GAP at most
+    return this.seen.length ? this.seen.at(-1).t - this.seen[0].t - this.unseen : 0;
   }
 
   uncalibrated() { // calibration.Stream.uncalibrated: why there is no calibration
