@@ -68,15 +68,20 @@ class Options(MotionFlags):
 class Loss:
     """What is lost: a share of single frames, or so many seconds of every EVERY; of devices, a name of `losses.SETS`.
 
+    always : from the first frame on, as with play.py's `--sensors hmd`: controllers that were never there hang
+
     Test      tests/extras/test_loss_table.py::test_rows"""
 
     name: str = "nothing"
     devices: str = "all"
     share: float = 0.0
     seconds: float = 0.0
+    always: bool = False
 
     def mask(self, t, rng) -> np.ndarray:
         """Which of the frames at t [s] are lost.  (n,) bool"""
+        if self.always:
+            return np.ones(len(t), bool)
         if self.seconds:
             lost = losses.long(t, self.seconds, rng, EVERY)
         else:
@@ -88,7 +93,7 @@ def rows() -> list[Loss]:
     """The table's rows.  Test: tests/extras/test_loss_table.py::test_rows"""
     single = [Loss(f"frames, {p:.0%}, {w}", d, share=p) for w, d in ONE_OR_ALL.items() for p in losses.SHARES]
     long = [Loss(f"{s:g} s of {EVERY:g}, {w}", d, seconds=s) for w, d in ANY.items() for s in LENGTHS]
-    return [Loss(), *single, *long]
+    return [Loss(), *single, *long, Loss("always, both hands", "hands", always=True)]
 
 
 @dataclass
@@ -166,7 +171,7 @@ def streams_of(char, capture: Capture, seed: int):
     out, height = [], None
     for loss in rows():
         rng = np.random.default_rng([seed, zlib.crc32(f"{capture.name} {loss.name}".encode())])
-        stream, ticks = Stream(char, **capture.how), []
+        stream, ticks = Stream(char, devices=1 if loss.always else 3, **capture.how), []
         for sample in losses.lose(capture.samples, loss.mask(capture.times, rng), loss.devices):
             ticks += stream.push(sample)
         if not ticks:

@@ -13,11 +13,12 @@ from plumbing.cli import UserError, run_main
 
 
 def test_rows():
-    """Nothing first; frames and seconds of one device and of all; nothing is lost while it calibrates."""
+    """Nothing first; frames and seconds of one device and of all; but by the last nothing is lost while it calibrates."""
     kinds, rng = losses.rows(), np.random.default_rng(0)
-    assert len({k.name for k in kinds}) == len(kinds) == 22 and kinds[0] == losses.Loss()
+    assert len({k.name for k in kinds}) == len(kinds) == 23 and kinds[0] == losses.Loss()
     t = 100.0 + np.arange(3000) / 30
-    for kind in kinds:
+    assert kinds[-1].always and kinds[-1].mask(t, rng).all() and not any(k.always for k in kinds[:-1])
+    for kind in kinds[:-1]:
         lost = kind.mask(t, rng)
         want = kind.seconds / losses.EVERY or kind.share
         assert not lost[:60].any() and abs(lost[60:].mean() - want) < 0.04, kind
@@ -47,6 +48,8 @@ def test_the_same_for_all():
     assert np.abs(a[names.index("2 s of 5, all")][0] - a[0][0]).max() > 0.01  # something was lost
     assert any(np.abs(x[0] - y[0]).max() > 0 for x, y in zip(a[1:], other[1:], strict=True))
     np.testing.assert_array_equal(a[0][0], other[0][0])
+    np.testing.assert_array_equal(a[-1][0][:, 0], a[0][0][:, 0])  # without controllers the headset is the same
+    assert np.ptp(a[-1][0][:, 1:, 2] - a[-1][0][:, :1, 2], axis=0).max() < 1e-6 < np.ptp(a[0][0][:, 1, 2])  # they hang
     with pytest.raises(UserError, match="a: .* rows show the headset for"):
         losses.streams_of(jesse, takes(0.5), 0)
 
