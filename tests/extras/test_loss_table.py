@@ -13,7 +13,7 @@ from plumbing.cli import UserError, run_main
 
 
 def test_rows():
-    """Nothing first; frames and seconds of one device and of all; but by the last nothing is lost while it calibrates."""
+    """Nothing first; single frames and seconds, of one device and of all; only the last begins before it calibrates."""
     kinds, rng = losses.rows(), np.random.default_rng(0)
     assert len({k.name for k in kinds}) == len(kinds) == 23 and kinds[0] == losses.Loss()
     t = 100.0 + np.arange(3000) / 30
