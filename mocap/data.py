@@ -180,6 +180,28 @@ def files_of(path: Path) -> list[Path]:
     return sorted(f for f in path.rglob("*") if f.suffix.lower() in (".bvh", ".amc") and not f.is_dir())
 
 
+def keys_of(path: Path, files) -> list[Path]:
+    """What `split_of` reads of a data set's files: each from the set's own folder on."""
+    top = path if path.is_dir() else path.parent
+    return [Path(top.resolve().name) / f.relative_to(top) for f in files]
+
+
+def check_unseen(sets, split) -> None:
+    """UserError: among several sets to train on, one that holds only people held out as unseen bodies.
+
+    Why       alone it is meant, and is split by its trials; beside others nobody reads the line that says so, and
+              afterwards no body is unseen
+    Test      tests/mocap/test_mocap.py::test_unseen_beside_others"""
+    for one in sets if split == "train" and len(sets) > 1 else ():
+        path = Path(one)
+        files = files_of(path) if one not in BUILTIN and path.exists() else []
+        if files and all(split_of(k) == "body" for k in keys_of(path, files)):
+            raise UserError(
+                f"{one}: holds only people held out as unseen bodies ({', '.join(UNSEEN)}): leave it out; by itself it "
+                "can be trained on"
+            )
+
+
 def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS_IT_IS) -> list[Clip]:
     """Single clips of a data set, at one rate.
 
@@ -197,6 +219,7 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
     if split not in SPLITS:
         raise UserError(f"split {split!r} is unknown; valid: {', '.join(SPLITS)}")
     if len(sets := parts(motion)) > 1:
+        check_unseen(sets, split)
         return [c for one in sets for c in load(one, rate, clips, split, reading)]
     if motion in BUILTIN:
         items = [(c.name, c.name, c) for c in builtin_clips(rate, name=motion)]
@@ -207,8 +230,7 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
         files = files_of(path)
         if not files:
             raise UserError(f"{motion}: a folder without motion; valid: one that holds .bvh or .amc files")
-        top = path if path.is_dir() else path.parent
-        keys = [Path(top.resolve().name) / f.relative_to(top) for f in files]
+        keys = keys_of(path, files)
         if split in ("train", "validation") and all(split_of(k) == "body" for k in keys):
             print(f"{motion}: only people held out as unseen bodies: meant, and split by their trials", file=sys.stderr)
             keys = [k.stem.rpartition("_")[2] for k in keys]
@@ -251,6 +273,7 @@ def sequences(
     a user's recording, is not looped.
     """
     if len(sets := parts(motion)) > 1:
+        check_unseen(sets, split)
         return [c for one in sets for c in sequences(one, split, clips, rate, seed, limit, verbose, reading)]
     return stitched(load(motion, rate, clips, split, reading), f"{motion} [{split}]", seed, limit, verbose)
 

@@ -15,6 +15,7 @@ from scipy.integrate import quad
 from scipy.interpolate import interp1d
 from scipy.spatial.transform import Rotation, Slerp
 
+from extras import train
 from human import (
     FEET,
     PARENTS,
@@ -760,6 +761,25 @@ def test_load_errors(tmp_path):
     assert "broken_002.bvh" in message(tmp_path)
     with pytest.raises(UserError, match="gone.bvh.*expected a regular .bvh file"):
         data.from_bvh(tmp_path / "gone.bvh")
+
+
+def test_unseen_beside_others(tmp_path):
+    """People held out as unseen bodies are not trained on among others by accident; alone, and to measure, they are."""
+    (tmp_path / "held").mkdir(), (tmp_path / "mixed").mkdir()
+    for name in ("16_01", "35_02"):
+        write_as(tmp_path / "held" / f"{name}.bvh", "bandai", walk(3.0))
+    write_as(tmp_path / "mixed" / "16_03.bvh", "bandai", walk(3.0))
+    write_as(tmp_path / "mixed" / "20_01.bvh", "bandai", walk(3.0))
+    held, mixed = str(tmp_path / "held"), str(tmp_path / "mixed")
+    for read in (data.load, data.sequences):
+        with pytest.raises(UserError, match="held: holds only people held out as unseen bodies"):
+            read(f"builtin,{held}", split="train")
+    opt = train.Options(motion=f"builtin,{held}")
+    with pytest.raises(UserError, match="held: holds only people held out as unseen bodies"):
+        train.clips_of(opt)
+    assert {c.name for c in data.load(held, split="train")} == {"16_01", "35_02"}
+    assert {"16_01", "35_02"} == {c.name for c in data.load(held, split="body")}
+    assert "20_01" in {c.name for c in data.load(f"builtin,{mixed}", split="train")}
 
 
 def test_joined(tmp_path, capsys):
