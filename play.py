@@ -40,7 +40,7 @@ from headset import axes, calibration
 from headset.axes import StreamFlags
 from headset.bsor import opened
 from headset.player import Pace, Player, drive, ride, stream_of
-from headset.reader import DEVICES, GAP, arriving, files_of, is_live
+from headset.reader import DEVICES, GAP, arriving, files_of, is_live, sound
 from human import heading, sensors
 from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_action, simulate
 from mocap.augment import resize
@@ -582,17 +582,12 @@ def play_recordings(char: Character, policy, path, devices: int, opt: Options) -
     A file that is no recording is named in a line and left out.  -> exit status, 1 if there was one
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
     check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
-    streams, broken, read = {}, [], 1 if opt.sensors == "hmd" else devices
-    for file in recordings_of(opt.stream):
-        try:
-            streams[file] = ticks_of(char, file, read, opt)
-        except UserError as error:
-            broken.append(str(error))
-    if not streams:
-        raise UserError(broken[0])
-    rides = ride(char, policy.mean_action, list(streams.values()), devices, opt.threads)
+    read = 1 if opt.sensors == "hmd" else devices
+    taken, broken = sound(lambda file: (file, ticks_of(char, file, read, opt)), recordings_of(opt.stream))
+    files, streams = zip(*taken, strict=True)
+    rides = ride(char, policy.mean_action, streams, devices, opt.threads)
     top, many = Path(opt.stream), os.path.isdir(opt.stream)
-    names = [str(f.relative_to(top)) if many else f.name for f in streams]
+    names = [str(f.relative_to(top)) if many else f.name for f in files]
     slides = [slides_of(char, r) for r in rides]
     each = (summary_of([r], [s], read) | {"completed": r.failures == 0} for r, s in zip(rides, slides))
     found = {"files": dict(zip(names, each)), "all": summary_of(rides, slides, read)}

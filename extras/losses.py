@@ -34,7 +34,7 @@ from headset.axes import choose
 from headset.bsor import opened
 from headset.calibration import HIPS, Stream
 from headset.player import Player, recorded, ride
-from headset.reader import SAMPLE_RATE, Sample
+from headset.reader import SAMPLE_RATE, Sample, sound
 from mocap.data import CONTROL_RATE, MotionFlags, load, parts
 from mocap.rigs import Reading
 from play import recordings_of
@@ -113,22 +113,6 @@ class Capture:
         """Its first seconds."""
         t = self.times
         return Capture(self.name, self.samples[: int(np.searchsorted(t, t[0] + seconds))], self.how)
-
-
-def sound(read, items) -> tuple[list, list[str]]:
-    """`read` of every item, and what is said of those that it cannot: they are left out.
-
-    Raises    UserError: that of the first, where none can be read
-    Test      tests/extras/test_loss_table.py::test_a_broken_recording"""
-    out, broken = [], []
-    for item in items:
-        try:
-            out.append(read(item))
-        except UserError as error:
-            broken.append(str(error))
-    if broken and not out:
-        raise UserError(broken[0])
-    return out, broken
 
 
 def captures(opt: Options) -> tuple[dict[str, list[Capture]], list[str]]:

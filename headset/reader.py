@@ -314,6 +314,23 @@ def files_of(path) -> list[Path]:
     return sorted(f for f in path.rglob("*") if f.suffix.lower() in KINDS and there(f))
 
 
+def sound(read, items) -> tuple[list, list[str]]:
+    """`read` of every item, and what is said of those that it cannot: they are left out.
+
+    Raises    UserError: that of the first, where none can be read
+    Test      tests/extras/test_loss_table.py::test_a_broken_recording,
+              tests/headset/test_stream.py::test_folder_of_recordings"""
+    out, broken = [], []
+    for item in items:
+        try:
+            out.append(read(item))
+        except UserError as error:
+            broken.append(str(error))
+    if broken and not out:
+        raise UserError(broken[0])
+    return out, broken
+
+
 def lines_of(path):
     """The lines of a file or a pipe, or of standard input for "-", as they come, none longer than LINE_LIMIT.
 

@@ -192,7 +192,9 @@ def check_unseen(sets, split) -> None:
     Why       alone it is meant, and is split by its trials; beside others nobody reads the line that says so, and
               afterwards no body is unseen
     Test      tests/mocap/test_mocap.py::test_unseen_beside_others"""
-    for one in sets if split == "train" and len(sets) > 1 else ():
+    if split != "train" or len(sets) == 1:
+        return
+    for one in sets:
         path = Path(one)
         files = files_of(path) if one not in BUILTIN and path.exists() else []
         if files and all(split_of(k) == "body" for k in keys_of(path, files)):
