@@ -254,7 +254,7 @@ class Trainer:
         x = policy.norm.normalise(env.full, out=self.x[t])
         self.mu[t] = policy.actor(x[:, : env.obs_size])
         noise = self.rng.standard_normal(self.mu[t].shape, dtype=np.float32)
-        self.action[t] = self.mu[t] + np.exp(policy.log_std) * noise
+        self.action[t] = self.driving(t) + np.exp(policy.log_std) * noise
         _, self.reward[t], self.terminated[t], self.truncated[t], info = env.step(self.action[t])
         ids, done = np.flatnonzero(self.truncated[t]), self.terminated[t] | self.truncated[t]
         if len(ids):  # what they saw before the reset
@@ -265,6 +265,10 @@ class Trainer:
             self.sums[f"end_{name}"] += int(info["ends"][name].sum())
         self.lengths.append(info["length"][done])
         self.shares.append((info["length"] / info["available"])[done])
+
+    def driving(self, t):
+        """The mean of the actions of step t: the policy's.  extras/teacher.py has others drive, too."""
+        return self.mu[t]
 
     def values(self):
         """V(o_t) and V(o_{t+1}) of everything collected, with the old network.
@@ -435,8 +439,7 @@ def train(opt: Options, env: Env, policy: Policy | None = None, trainer=Trainer)
 
 def main(argv=None):
     """python ppo.py: train by the character's recipe, or resume.  Test: tests/robustness/test_cli.py::test_ppo"""
-    module = training.trained_by(character.Switches, argv, Options.BY)
-    if module != Options.BY:
+    if (module := training.trained_by(character.Switches, argv, Options.BY)) != Options.BY:
         print(f"trained by {module}, as the recipe or the run says (--recipe none: by ppo.py's own defaults)")
         return training.main_of(module)(argv)
     opt = training.read_options(Options, argv, "ppo.py", __doc__, widths)

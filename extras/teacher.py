@@ -16,7 +16,9 @@ leads there.
 
 An expert is a policy that learnt a few kinds of motion alone, steps backwards for example, and forgot the others
 meanwhile.  In sequences that are its own the student copies it, arms too, and in all others the old policy.  An average
-of their weights does not step backwards (LOG.md, 2026-11-29).
+of their weights does not step backwards (LOG.md, 2026-11-29).  A student that has not yet taken a step back sees only
+how one falls, and is told there what an expert would do that never gets there: so the expert itself drives `drive` of
+the characters in its sequences, the mixture of [Ross11].
 
 The student sees sensors alone, as ever.  Its normaliser stays as it was; its critic learns what the new actions are
 worth.
@@ -43,7 +45,7 @@ from env import Env
 from extras import train
 from extras.policies import pairs_of
 from nn import clip_grad_norm
-from plumbing.cli import POSITIVE, UserError, arg, run_main
+from plumbing.cli import POSITIVE, UNIT, UserError, arg, run_main
 from plumbing.training import given_names, progress_line, read_options
 from policy import check_fits, load_policy, widths
 
@@ -61,6 +63,7 @@ class Options(train.Options):
     expert: tuple[str, ...] = arg(
         (), "instead of the arms: whom to copy in which sequences, by shell patterns", metavar="PATTERN=POLICY,…"
     )
+    drive: float = arg(0.0, "share of the characters that experts drive, in their sequences", check=UNIT)
     teacher_lr: float = arg(3e-4, "learning rate of the student's copying", check=POSITIVE)
 
 
@@ -148,6 +151,7 @@ class Student(ppo.Trainer):
         self.experts, self.whose = experts(opt.expert, env)
         self.arms = taught(env.char, () if opt.expert else opt.joints)
         self.teacher = Teacher(env) if len(self.arms) else None
+        self.driven = np.arange(env.n) < opt.drive * env.n
         self.wanted, self.by_teacher = np.zeros_like(self.mu), np.zeros(self.mu.shape, bool)
         self.adam_pi.lr = opt.teacher_lr
 
@@ -161,6 +165,13 @@ class Student(ppo.Trainer):
             rows = self.whose[self.env.sequence] == k
             wanted[rows], by_teacher[rows] = expert.mean_action(seen[rows]), True
         super().step(t)
+
+    def driving(self, t):
+        """The student's mean actions, and the experts' where they drive.  (N, u)
+
+        Test      tests/extras/test_teacher.py::test_an_expert_drives"""
+        rows = self.driven & (self.whose[self.env.sequence] >= 0)
+        return np.where(rows[:, None], self.wanted[t], self.mu[t])
 
     def update(self) -> dict:
         r"""Epochs of minibatches of the two losses.
@@ -209,6 +220,8 @@ def main(argv=None):
         raise UserError("--gpu: a student copies on the processor alone: leave it out")
     if opt.expert and "joints" in given_names(argv):
         raise UserError("--joints: beside --expert no joints are taught: leave out one of the two")
+    if opt.drive and not opt.expert:
+        raise UserError("--drive: an expert drives: valid with --expert")
     ppo.train(opt, train.make_env(opt), trainer=Student)
 
 

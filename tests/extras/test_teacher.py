@@ -161,6 +161,25 @@ def test_student_of_an_expert(start, tmp_path):
     assert taught[-10:].mean() < 0.8 * taught[:3].mean()
 
 
+def test_an_expert_drives(start, tmp_path):
+    """A share of the characters does what the expert would, in the expert's sequences; all others what the student
+    would; and the noise is the student's."""
+    train.main([*TINY, "--out", str(tmp_path / "expert"), "--steps", "64", "--seed", "5"])
+    opt = teacher.Options(init=str(start), clips="*", envs=16, horizon=4, threads=1, drive=0.5, expert=("x",))
+    env = ppo.make_env(opt)
+    env.reset(seed=3)
+    opt = replace(opt, expert=(f"{env.ref.names[env.sequence[0]]}={tmp_path / 'expert'}",))
+    student = teacher.Student(opt, env, load_policy(start)[0])
+    student.policy.log_std[:] = -20.0
+    own = (env.sequence == env.sequence[0]) & (np.arange(16) < 8)
+    student.collect()
+    assert 0 < own.sum() < 8
+    for i in range(16):
+        told = student.wanted if own[i] else student.mu
+        np.testing.assert_allclose(student.action[0, i], told[0, i], atol=1e-6)
+    assert np.abs(student.wanted - student.mu)[0, own].max() > 1e-3
+
+
 def test_resume_is_exact(start, tmp_path):
     """Two updates, then two more, are four."""
     run(tmp_path / "whole", 4, "--init", str(start))
@@ -177,6 +196,7 @@ def test_command(start, tmp_path, capsys):
     for flags, says in (
         (["--gpu"], "--gpu: a student copies on the processor"),
         (["--expert", "*=x.npz", "--joints", "tail"], "--joints: beside --expert no joints are taught"),
+        (["--drive", "0.5"], "--drive: an expert drives: valid with --expert"),
     ):
         with pytest.raises(SystemExit):
             run_main(teacher.main, [*TINY, "--init", str(start), *flags, "--out", str(tmp_path / "a")])
