@@ -540,7 +540,7 @@ def ticks_of(char: Character, path, devices: int, opt: Options):
     ticks = [tick for sample in opened(path, devices=devices)[1] for tick in source.push(sample)]
     if not ticks:
         raise UserError(f"{path}: {source.uncalibrated()}")
-    say([] if how.usual else how.lines, path)
+    say(how.told, path)
     say(source.times(), path)
     ticks = ticks[: max(1, round(opt.seconds * CONTROL_RATE)) if opt.seconds else None]
     return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks])

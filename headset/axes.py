@@ -115,6 +115,11 @@ class Choice(NamedTuple):
         plain = f"{FOUND} --axes unity --grip {GRIP['unity']:g}", f"{OWN} --axes unity"
         return set(self.lines) <= set(plain)
 
+    @property
+    def told(self) -> list:
+        """The lines that a user should see: none of a usual choice.  Test: tests/headset/test_axes.py::test_usual"""
+        return [] if self.usual else self.lines
+
 
 # ------------------------------------------------------------------------------------ what tells
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from headset.axes import Choice, choose
 from headset.bsor import opened
 from headset.calibration import Resampler, standing_height
-from headset.reader import Clock, Guard, Sample, files_of, to_world
+from headset.reader import Clock, Guard, Sample, files_of, sound, to_world
 from human import SEG, SEGMENTS, SENSOR_OFFSETS, Clip, heading, quat_about, quat_continuous, quat_matrix, quat_rotate
 from mocap.data import CONTROL_RATE
 from mocap.gait import Body, smooth, two_bone_leg
@@ -174,22 +174,24 @@ def players(folder) -> list[Clip]:
     """A body for every recording of a folder that shows a standing player; others are left out, and named.
 
     Axes      each file's own, or those that fit it best (`headset.axes.choose`)
-    Raises    UserError: no recordings there
+    Raises    UserError: no recordings there, or none that can be read
     Test      tests/headset/test_body.py::test_recordings, test_axes_of_players"""
-    out = []
-    for file in files_of(folder):
-        try:
-            how = choose(file)
-            pos, quat = read_recording(file, how)
-            for line in [] if how.usual else how.lines:
-                print(printable(f"{file}: {line}"))
-            height = standing_height(pos[:, 0])
-            if not 1.0 <= height <= 2.1:
-                raise UserError(f"{file}: the headset is {height:.2f} m up; valid: 1.0 to 2.1 m, the floor at 0")
-            out.append(embodied(pos, quat, file.stem))
-        except UserError as error:
-            print(f"left out: {error}")
-    if not out:
+
+    def embody(file):
+        how = choose(file)
+        pos, quat = read_recording(file, how)
+        for line in how.told:
+            print(printable(f"{file}: {line}"))
+        height = standing_height(pos[:, 0])
+        if not 1.0 <= height <= 2.1:
+            raise UserError(f"{file}: the headset is {height:.2f} m up; valid: 1.0 to 2.1 m, the floor at 0")
+        return embodied(pos, quat, file.stem)
+
+    files = files_of(folder)
+    if not files:
         valid = "a folder of .csv or .bsor files that `play.py --stream` reads"
         raise UserError(f"{folder}: no recordings; valid: {valid}")
+    out, broken = sound(embody, files)
+    for error in broken:
+        print(f"left out: {error}")
     return out

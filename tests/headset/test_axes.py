@@ -196,13 +196,13 @@ def test_usual(tmp_path):
     """Nothing need be said of Unity's axes; of all else, and of what is not sure, something."""
     path = tmp_path / "u.csv"
     path.write_text("".join(lines_of_user()))
-    assert choose(path).usual and choose("-").usual
+    assert choose(path).usual and choose("-").usual and choose(path).lines and choose(path).told == []
     assert not any(choose(path, **k).usual for k in ({"order": (0, 2, 1)}, {"unit": 0.02}, {"wanted": "openxr"}))
     path.write_text("# axes: unity\n" + "".join(lines_of_user()))
     assert choose(path).usual
     for lines in (lines_of_user("openxr"), lines_of_user()[:3]):
         path.write_text("".join(lines))
-        assert not choose(path).usual
+        assert not choose(path).usual and choose(path).told == choose(path).lines != []
     assert not guess(in_axes(unit=0.01)).usual and not guess(in_axes(order=(0, 2, 1))).usual
 
 

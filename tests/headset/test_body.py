@@ -88,14 +88,17 @@ def test_two_bone_arm():
     np.testing.assert_allclose(-far[:, :, 2], way / np.linalg.norm(way, axis=1, keepdims=True), atol=1e-3)
 
 
-def test_recordings(tmp_path, capsys):
+def test_recordings(worn, tmp_path, capsys):
     """A folder of recordings: one that is none is named and left out; none at all is an error."""
     with pytest.raises(UserError, match="no recordings; valid: a folder of .csv or .bsor files"):
         body.players(tmp_path)
     (tmp_path / "broken.csv").write_text("time,head_px\n0,1\n")
-    with pytest.raises(UserError, match="no recordings"):
+    with pytest.raises(UserError, match="broken.csv, line 1: no column"):
         body.players(tmp_path)
-    assert "left out: " in capsys.readouterr().out
+    clip, (pos, quat) = worn
+    (tmp_path / "sound.csv").write_text("".join(to_csv(np.arange(len(pos)) / clip.rate, pos, quat, "unity")))
+    assert [c.name for c in body.players(tmp_path)] == ["sound"]
+    assert f"left out: {tmp_path / 'broken.csv'}, line 1: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("first, unit", [("# axes: openxr\n", 1.0), ("", 0.01)])
