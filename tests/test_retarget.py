@@ -426,6 +426,11 @@ def test_shortest(rng):
     best = min((np.array(k) for k in itertools.product((0, 1), repeat=9)), key=total)
     assert np.array_equal(retarget.shortest(cost, jump), best)
     assert retarget.shortest(cost[:1], jump[:0]).tolist() == [int(cost[0].argmin())]
+    for way in (0, 1):  # no frame's cheaper choice costs a jump; then one does
+        jump[:, 0, 0], jump[:, 1, 1], cost[4, way] = 0.0, 0.0, -0.01
+        cost[:, 0] = np.minimum(cost[:, 0], cost[:, 1] - 0.01 * (1 - 2 * way))
+        best = min((np.array(k) for k in itertools.product((0, 1), repeat=9)), key=total)
+        assert np.array_equal(retarget.shortest(cost, jump), best)
 
 
 @pytest.mark.parametrize("side", "lr")
