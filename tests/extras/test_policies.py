@@ -11,13 +11,13 @@ import character
 import nn
 import ppo
 import retarget
-from env import Env
+from env import Env, headset_only
 from extras import policies
 from extras.policies import Carry, carried, input_names
 from mocap import data
 from plumbing.cli import UserError
 from plumbing.runs import CHECKPOINT, load_checkpoint, save_checkpoint
-from policy import Policy, load_policy, total_steps
+from policy import Policy, load_policy, total_steps, trained_as
 
 # ------------------------------------------------------------------------------------ ship, blend
 
@@ -153,6 +153,46 @@ def test_blended(tmp_path):
 # ------------------------------------------------------------------------------------ carry
 
 
+@pytest.mark.parametrize("devices", (3, 1))
+def test_led(char, ref, devices):
+    """It acts as the old policy does where all devices are ahead by what the headset goes in that time; heights and
+    rotations are as they were, so is the critic, and led back it is the old one."""
+    env = Env(char, headset_only(ref) if devices == 1 else ref, 64, seed=1)
+    env.reset(seed=2)
+    policy = Policy(env.obs_size, env.critic_size, env.action_size, (16, 8), (8,), 0.1, 1.0, np.random.default_rng(0))
+    policy.norm.update(env.full)  # means that are not 0
+    policy.actor.params["W2"][:] *= 100.0
+    obs, names = env.reset(seed=3)[0].astype(float), input_names(char, devices, asymmetric=False)
+    policy.norm.clip = 100.0  # beyond which it is another function
+    ahead = obs.copy()
+    for row, shown in zip(obs, ahead):
+        seen = dict(zip(names, row))
+        for k, (term, *rest) in enumerate(name.split(".") for name in names):
+            if term.startswith("user") and rest[1] in "xy":
+                shown[k] += 0.07 * 30.0 * (seen[f"user.h.{rest[1]}"] - seen[f"user_previous.h.{rest[1]}"])
+    assert np.abs(ahead - obs).max() > 0.02
+    expected, before = policy.mean_action(ahead), policy.mean_action(obs)
+    assert np.abs(expected - before).max() > 0.05
+    critic = policy.critic.theta.copy()
+    np.testing.assert_allclose(policies.led(policy, char, 0.07, devices).mean_action(obs), expected, atol=2e-4)
+    np.testing.assert_array_equal(policy.critic.theta, critic)
+    np.testing.assert_allclose(policies.led(policy, char, -0.07, devices).mean_action(obs), before, atol=2e-4)
+
+
+def test_led_by_command(whole, tmp_path, capsys):  # noqa: F811
+    """`ship --lead` says in the file how far ahead, and adds to what was there."""
+    once, twice = tmp_path / "once.npz", tmp_path / "twice.npz"
+    policies.main(["ship", str(whole), str(once), "--lead", "0.05"])
+    policies.main(["ship", str(once), str(twice), "--lead", "0.02"])
+    assert [round(load_policy(p)[1]["lead"], 6) for p in (once, twice)] == [0.05, 0.07]
+    policy, meta = load_policy(whole)
+    char = trained_as(meta, whole).load()
+    np.testing.assert_allclose(load_policy(twice)[0].theta_pi, policies.led(policy, char, 0.07).theta_pi, atol=1e-5)
+    with pytest.raises(SystemExit):
+        policies.main(["ship", str(whole), str(once), "--lead", "2"])
+    assert "from -0.5 to 0.5 s" in capsys.readouterr().err
+
+
 def test_input_names(char, ref):
     """Each name where the observation has that number: looked up in MuJoCo's own arrays."""
     env = Env(char, ref, 2, seed=1)
@@ -195,7 +235,7 @@ def test_wider_layers():
     new = policies.with_layers(old, (16, 6), (12,), "a.npz")
     x = rng.normal(2.0, 3.0, (20, 11)).astype(np.float32)
     np.testing.assert_allclose(new.mean_action(x[:, :9]), old.mean_action(x[:, :9]), atol=1e-6)
-    np.testing.assert_allclose(new.value(new.norm.normalise(x)), old.value(old.norm.normalise(x)), rtol=1e-5)
+    np.testing.assert_allclose(new.value(new.norm.normalise(x)), old.value(old.norm.normalise(x)), rtol=1e-4)
     np.testing.assert_array_equal(new.log_std, old.log_std)
     assert new.shape() == old.shape() | {"hidden": [16, 6], "value_hidden": [12]}
     for wrong in (((8, 5), (7,)), ((8, 6, 4), (7,)), ((8, 6), (6,))):
@@ -214,7 +254,7 @@ def test_headset_only(whole, tmp_path, char):  # noqa: F811
     x = (old.norm.mean + rng.normal(size=(50, 459)) / old.norm.inv_std).astype(np.float32)
     x[:, gone] = old.norm.mean[gone]
     np.testing.assert_allclose(new.mean_action(x[:, keep[:153]]), old.mean_action(x[:, :189]), atol=1e-6)
-    np.testing.assert_allclose(new.value(new.norm.normalise(x[:, keep])), old.value(old.norm.normalise(x)), rtol=1e-5)
+    np.testing.assert_allclose(new.value(new.norm.normalise(x[:, keep])), old.value(old.norm.normalise(x)), rtol=1e-4)
     moved = x.copy()
     moved[:, gone] += 1.0
     assert np.abs(old.mean_action(moved[:, :189]) - old.mean_action(x[:, :189])).max() > 1e-4  # they had mattered
@@ -237,7 +277,7 @@ def test_symmetric_critic(whole, char):  # noqa: F811
     x[:, 189:] = old.norm.mean[189:]
     np.testing.assert_allclose(new.mean_action(x[:, :189]), old.mean_action(x[:, :189]), atol=1e-6)
     seen = new.norm.normalise(x[:, :189])
-    np.testing.assert_allclose(new.value(seen), old.value(old.norm.normalise(x)), rtol=1e-5)
+    np.testing.assert_allclose(new.value(seen), old.value(old.norm.normalise(x)), rtol=1e-4)
 
 
 def test_another_character(whole, tmp_path, capsys):  # noqa: F811
