@@ -5,16 +5,14 @@ Red arrows are forces from outside, blue ones the contact forces of [DROP Eq. 11
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import mujoco
 import numpy as np
 
 from drop import body
 from drop.body import RADII, STEP, J, N
+from mocap.data import parts
 from plumbing import render
-from plumbing.cli import UserError
+from plumbing.files import check_folders
 
 WORLD = """<mujoco><visual><map zfar="60"/>
 <headlight ambient=".35 .35 .35" diffuse=".4 .4 .4" specular="0 0 0"/></visual>
@@ -114,10 +112,8 @@ def write_pictures(takes, opt, columns=9):
 
 
 def check_outputs(opt):
-    """Can the pictures be written?  Before the slow work.
+    """Can the pictures be written, and do they destroy nothing that is read?  Before the slow work.
 
     Test: tests/drop/test_drop_demos.py::test_outputs_are_checked_first"""
-    for path in map(Path, filter(None, (opt.png, opt.video))):
-        if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-            raise UserError(f"cannot write {path}: give a file in a folder that exists and is writable")
+    check_folders(opt.png, opt.video, read=(*parts(opt.motion), opt.weights))
     render.check_video(opt.video)

@@ -524,7 +524,7 @@ def correct(argv) -> int:
     opt = cli(CorrectOptions, argv, "python -m skeletal correct", CorrectOptions.__doc__)
     out = Path(opt.out or "runs/correct")
     check_run(out, None)
-    check_folders(opt.ship)
+    check_folders(opt.ship, read=(opt.motion,))
     sides = gather(opt)
     open_run(out, asdict(opt), None)
     copies = copies_between(sides)

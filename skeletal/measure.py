@@ -187,7 +187,7 @@ def summary(pairs) -> dict:
 def measure(argv) -> int:
     """python -m skeletal measure.  Test: tests/skeletal/test_skeletal_correct.py::test_measure"""
     opt = cli(MeasureOptions, argv, "python -m skeletal measure", MeasureOptions.__doc__)
-    check_folders(opt.json, opt.png)
+    check_folders(opt.json, read=opt.weights.split(","))
     nets = [Correction(p) for p in opt.weights.split(",")]
     if any(n.names != nets[0].names for n in nets):
         raise UserError(f"--weights {opt.weights}: trained on different rigs; valid: seeds of one training")

@@ -259,7 +259,7 @@ best of the three copies; slide: mean speed of standing feet [cm/s], retargeted,
 def families(argv) -> int:
     """python -m skeletal families: errors x 1000.  Test: tests/skeletal/test_skeletal_play.py::test_measure_command"""
     opt = cli(FamilyOptions, argv, "python -m skeletal families", FamilyOptions.__doc__)
-    check_folders(opt.json, opt.png)
+    check_folders(opt.json, read=opt.weights.split(","))
     make_folder(opt.png)
     nets = {name: Retargeter(name) for name in opt.weights.split(",")}
     cases = held_out(opt, next(iter(nets.values())))

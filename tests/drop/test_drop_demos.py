@@ -478,6 +478,10 @@ def test_outputs_are_checked_first(monkeypatch, tmp_path):
     for flag, path in (("--png", tmp_path), ("--png", nowhere / "a.png"), ("--video", nowhere / "a.mp4")):
         with pytest.raises(UserError, match="cannot write"):
             demos.main(["push", flag, str(path)])
+    take = tmp_path / "a.bvh"
+    take.write_text("HIERARCHY")
+    with pytest.raises(UserError, match="it is read from"):
+        demos.main(["push", "--motion", str(take), "--png", str(take)])
 
 
 def test_command(stage, monkeypatch, capsys, tmp_path):

@@ -106,7 +106,7 @@ def test_nothing_read_is_overwritten(trained, tmp_path, capsys):
         assert f"cannot write {out}: it is {why}" in capsys.readouterr().err
     assert a.read_bytes() == before == b.read_bytes() and kept.read_text() == "mine"
     assert run("families", "--weights", trained / "run", "--png", tmp_path / "none" / "b") == 2
-    assert "there is no folder" in (said := capsys.readouterr()).err and "copy" not in said.out
+    assert "cannot make the folder" in (said := capsys.readouterr()).err and "copy" not in said.out
 
 
 def test_ship_and_load(trained, tmp_path):
