@@ -28,7 +28,7 @@ from nn import MLP, RunningNorm
 from plumbing.cli import ALL_POSITIVE, POSITIVE, UNIT, UserError, arg, cli, given_flags, run_main, some_of, words_first
 from plumbing.files import check_folders
 from plumbing.runs import fmt_count, git_state, save_checkpoint, versions
-from policy import Policy, load_policy, sensors_of, total_steps, trained_as
+from policy import Policy, devices_of, load_policy, sensors_of, total_steps, trained_as
 
 LEADS = (lambda v: abs(v) <= 0.5, "from -0.5 to 0.5 s")
 SIGMA = 0.135  # exploration noise of a policy that goes on as another character, where that one's recipe has none
@@ -190,8 +190,8 @@ def ship(run, path, blend=(), share=0.5, gain=1.0, lead=0.0) -> dict:
     policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})
     kept |= {"gain": gain} if gain != 1.0 else {}
     if lead:
-        char, devices = trained_as(meta, run).load(), 1 if sensors_of(meta, run) == "hmd" else 3
-        policy, kept["lead"] = led(policy, char, lead, devices), lead + meta.get("lead", 0.0)
+        policy = led(policy, trained_as(meta, run).load(), lead, devices_of(meta, run, None))
+        kept["lead"] = lead + meta.get("lead", 0.0)
     if blend:
         kept["blend"] = {"with": [Path(p).name for p in blend], "share": share}
     kept |= {"licence": each_once(licences) or "MIT", "versions": versions(), "git": git_state()}

@@ -150,9 +150,6 @@ def test_blended(tmp_path):
     assert not (tmp_path / "c.npz").exists()
 
 
-# ------------------------------------------------------------------------------------ carry
-
-
 @pytest.mark.parametrize("devices", (3, 1))
 def test_led(char, ref, devices):
     """It acts as the old policy does where all devices are ahead by what the headset goes in that time; heights and
@@ -191,6 +188,9 @@ def test_led_by_command(whole, tmp_path, capsys):  # noqa: F811
     with pytest.raises(SystemExit):
         policies.main(["ship", str(whole), str(once), "--lead", "2"])
     assert "from -0.5 to 0.5 s" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------ carry
 
 
 def test_input_names(char, ref):
@@ -235,7 +235,7 @@ def test_wider_layers():
     new = policies.with_layers(old, (16, 6), (12,), "a.npz")
     x = rng.normal(2.0, 3.0, (20, 11)).astype(np.float32)
     np.testing.assert_allclose(new.mean_action(x[:, :9]), old.mean_action(x[:, :9]), atol=1e-6)
-    np.testing.assert_allclose(new.value(new.norm.normalise(x)), old.value(old.norm.normalise(x)), rtol=1e-4)
+    np.testing.assert_allclose(new.value(new.norm.normalise(x)), old.value(old.norm.normalise(x)), rtol=1e-5)
     np.testing.assert_array_equal(new.log_std, old.log_std)
     assert new.shape() == old.shape() | {"hidden": [16, 6], "value_hidden": [12]}
     for wrong in (((8, 5), (7,)), ((8, 6, 4), (7,)), ((8, 6), (6,))):
@@ -254,7 +254,9 @@ def test_headset_only(whole, tmp_path, char):  # noqa: F811
     x = (old.norm.mean + rng.normal(size=(50, 459)) / old.norm.inv_std).astype(np.float32)
     x[:, gone] = old.norm.mean[gone]
     np.testing.assert_allclose(new.mean_action(x[:, keep[:153]]), old.mean_action(x[:, :189]), atol=1e-6)
-    np.testing.assert_allclose(new.value(new.norm.normalise(x[:, keep])), old.value(old.norm.normalise(x)), rtol=1e-4)
+    for policy in (old, new):  # in double precision: the order of single precision's sums is the BLAS's affair
+        policy.critic.theta = policy.critic.theta.astype(float)
+    np.testing.assert_allclose(new.value(new.norm.normalise(x[:, keep])), old.value(old.norm.normalise(x)), rtol=1e-5)
     moved = x.copy()
     moved[:, gone] += 1.0
     assert np.abs(old.mean_action(moved[:, :189]) - old.mean_action(x[:, :189])).max() > 1e-4  # they had mattered
@@ -277,7 +279,7 @@ def test_symmetric_critic(whole, char):  # noqa: F811
     x[:, 189:] = old.norm.mean[189:]
     np.testing.assert_allclose(new.mean_action(x[:, :189]), old.mean_action(x[:, :189]), atol=1e-6)
     seen = new.norm.normalise(x[:, :189])
-    np.testing.assert_allclose(new.value(seen), old.value(old.norm.normalise(x)), rtol=1e-4)
+    np.testing.assert_allclose(new.value(seen), old.value(old.norm.normalise(x)), rtol=1e-5)
 
 
 def test_another_character(whole, tmp_path, capsys):  # noqa: F811
