@@ -77,8 +77,8 @@ def check_folders(*paths, read=()) -> None:
     """Before the slow work: the files to write, None left out, have a folder and destroy nothing.
 
     Args      read : files and folders that are read, None left out
-    Raises    UserError: no such folder; the file is a folder, one of those read, or there in a folder of them; it is
-              read-only, or no name of a file
+    Raises    UserError: no such folder, or one that is read-only; the file is a folder, one of those read, or there in
+              a folder of them; it is read-only, or no name of a file
     Test      tests/robustness/test_cli.py::test_folder_to_write, test_nothing_read_is_overwritten
     """
     for out in filter(None, paths):
@@ -89,6 +89,8 @@ def check_folders(*paths, read=()) -> None:
             raise UserError(f"cannot write {out}: {error.strerror}; give another file") from None
         if not file.parent.is_dir():
             raise UserError(f"cannot write {out}: there is no folder {Path(out).parent}")
+        if mode is None and not os.access(file.parent, os.W_OK):
+            raise UserError(f"cannot write {out}: the folder {Path(out).parent} is read-only; give another file")
         if any(_is_read(file, Path(source).resolve()) for source in read if source):
             raise UserError(f"cannot write {out}: it is read from, or in a folder that is; give another file")
         if mode and stat.S_ISDIR(mode):

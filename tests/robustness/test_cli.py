@@ -215,7 +215,7 @@ def test_make_folder(tmp_path):
     assert (tmp_path / "b").read_text() == "mine" and not (tmp_path / "none").exists()
 
 
-def test_folder_to_write(here, capsys):
+def test_folder_to_write(here, capsys, monkeypatch):
     """Said before the slow work: no motion is read."""
     for script, flags in (
         ("retarget", ("--bvh", "--png", "--video")),
@@ -228,6 +228,9 @@ def test_folder_to_write(here, capsys):
             assert f"cannot write {out}: there is no folder {here / 'no'}" in err
         err = refuse(capsys, here, script, *more, "--motion", "none", "--png", here / "x.tga")
         assert "x.tga is not valid; it must be a name that ends in .png" in err
+    monkeypatch.setattr("plumbing.files.os.access", lambda path, how: path != here)  # root may write everywhere
+    with pytest.raises(UserError, match="the folder .* is read-only; give another file"):
+        check_folders(here / "x.bvh")
 
 
 def test_nothing_read_is_overwritten(here, capsys):
