@@ -378,10 +378,10 @@ def escape(state, balls, speed=1.4, lead=None):
     return ramp(v, ways[int(np.min(miss, axis=0).argmax())], STEP)[0]
 
 
-def projectiles(stage, rng):
+def projectiles(stage, rng, dodging=(False, True)):
     """§8.2: balls of 1 kg at 9 m/s, every 0.9 s from another side; then the same with dodging."""
     takes = []
-    for dodge in (False, True):
+    for dodge in dodging:
         sim, state = stage.start(1.2)
         balls, seen, lead = [], set(), [None]
         if dodge:

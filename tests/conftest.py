@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+# As ppo.py does: two tests beside each other, or a training run beside the tests, make threads of BLAS wait for each
+# other, ten times as long.  And with another number of threads sums differ in their last bit, which a fall makes large.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 sys.path += [str(folder) for folder in sorted((ROOT / "tests").iterdir()) if folder.is_dir()]  # helpers of other tests

@@ -492,8 +492,8 @@ def test_figure(two, figure, tmp_path, monkeypatch, capsys):
     """The numbers are `metrics.streamed`'s; the sheet has a band of them under every policy; so has the video."""
     if render.gl_backend() is None:
         pytest.skip("no OpenGL")
-    plain = play.comparison_sheet
-    monkeypatch.setattr(play, "comparison_sheet", lambda *a, **k: plain(*a, size=(300, 80), **k))
+    small = functools.partial(play.comparison_sheet, size=(300, 80))
+    monkeypatch.setattr(play, "comparison_sheet", small)
     assert play.main(["--figure", "6", "--png", str(tmp_path / "f.png"), "--seconds", "1", "--threads", "1"]) == 0
     [arm, _] = metrics.arms_of([figure], play.Options(compare=tuple(map(str, two)), threads=1))
     row = metrics.streamed(arm.char, arm.policy.mean_action, [figure], arm.devices, 1)
@@ -502,7 +502,7 @@ def test_figure(two, figure, tmp_path, monkeypatch, capsys):
     options = play.Options(figure=6, compare=tuple(map(str, two)), rows=("streamed",), threads=1, seconds=1.0)
     arms = metrics.arms_of([figure], options)
     numbers = {a.path: "one 1  two 2" for a in arms}
-    with_numbers, without = plain(arms, figure, options, numbers=numbers), plain(arms, figure, options)
+    with_numbers, without = small(arms, figure, options, numbers=numbers), small(arms, figure, options)
     assert len(with_numbers) - len(without) == 2 * 20 and with_numbers.shape[1] == without.shape[1]
     np.testing.assert_array_equal(with_numbers[-20:], play.lines_of("one 1  two 2", without.shape[1])[0])
     images = list(play.film(arms, figure, options, numbers, size=(96, 80)))

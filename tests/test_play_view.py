@@ -116,7 +116,7 @@ def browser(url, folder):
             def call(method, **params):
                 tab.send(json.dumps(dict(id=1, method=method, params=params)))
                 while True:
-                    message = json.loads(tab.recv(timeout=60))
+                    message = json.loads(tab.recv(timeout=180))
                     if message.get("id") == 1:
                         assert "error" not in message, message
                         return message["result"]
@@ -155,7 +155,7 @@ def test_browser_shows_the_character_moving(policy, tmp_path):
                 return np.array(list(evaluate(ORANGE % shot) or "0")) == "1"
 
             first = wait_for("character", lambda: [h] if (h := hoodie()).sum() > 100 else None, 120)[0]
-            wait_for("movement", lambda: (h := hoodie()).sum() > 100 and np.sum(h != first) > 20)
+            wait_for("movement", lambda: (h := hoodie()).sum() > 100 and np.sum(h != first) > 20, 180)
         assert get(f"http://localhost:{port}/")[0] == 200 and server.poll() is None
 
 

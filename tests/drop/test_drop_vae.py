@@ -577,6 +577,8 @@ def test_free_rollout():
 def test_command(tmp_path, monkeypatch, capsys):
     """python -m drop: every command, and one line for whatever is wrong."""
     monkeypatch.setattr(train, "recorded", lambda *a, **k: [motion(), motion("stand")])
+    detection = train.detection
+    monkeypatch.setattr(train, "detection", lambda *args: detection(*args[:-1], n=40))  # of 500 it takes half a minute
 
     def run(*args):
         with pytest.raises(SystemExit) as end:
