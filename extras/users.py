@@ -1,10 +1,12 @@
-r"""Users of other builds through the whole pipeline, and how a character fails under them  [Reda23 §4.1].
+r"""Other users through the whole pipeline, and how a character fails under them  [Reda23 §4.1, §6].
 
-    python -m extras.users --motion FOLDER --clips '*walk*'                  by height, 1.45 to 2.00 m, and by build
-    python -m extras.users --motion FOLDER --as-is                           the users as they are: dance, sport, arms
+    python -m extras.users --motion FOLDER --clips '*walk*'    of other builds, by height, 1.45 to 2.00 m
+    python -m extras.users --motion FOLDER --by none           as they are: dance, sport, arms
+    python -m extras.users --motion FOLDER --by pace           slower and faster: §6's fast motion
+    python -m extras.users --motion FOLDER --by crossing       legs under another's trunk: §6's uncorrelated motion
 
-    clip ──► of_build ──► recorded headset, calibrated ──► ride ──► completed, falls, losses, errors
-             joints       by its first second              streamed, from the default pose
+    clips ──► of_build, warp, crossed ──► recorded headset, calibrated ──► ride ──► completed, falls, losses, errors
+              joints                      by its first second              streamed, from the default pose
 
 Nothing is told of a user's build: stature, trunk and arms change the human, from it the devices are taken, and from
 their first second the calibration.  Falls and losses are counted apart: to topple is not to be left behind.
@@ -14,7 +16,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as ppo.py does, and says why; before NumPy is loaded
 
@@ -23,8 +25,8 @@ import numpy as np
 import metrics
 from character import Character
 from headset.player import Player, ride, stream_of
-from human import SENSOR_OFFSETS, headset_height
-from mocap.augment import resize
+from human import SEG, SENSOR_OFFSETS, headset_height, quat_conj, quat_mul, quat_rotate
+from mocap.augment import resize, warp
 from mocap.data import CONTROL_RATE, parts
 from play import slides_of
 from plumbing.cli import THREADS, UserError, arg, cell, cli, given_flags, markdown, run_main
@@ -39,6 +41,8 @@ BUILDS = {  # ASSUMED: trunk and arms in proportion to the legs, as times the re
     "short arms": (1.0, 0.85),
 }
 MIDDLE = 1.75  # m: at other heights the arms are as recorded
+PACES = (0.75, 1.0, 1.25, 1.5, 2.0)  # times as fast as recorded
+UPPER = [i for name, i in SEG.items() if not name.startswith(("pelvis", "thigh", "shin", "foot"))]
 STATURES = (lambda v: v and all(0.5 <= x <= 2.5 for x in v), "one or more statures from 0.5 to 2.5 metres, as 1.6,1.9")
 
 
@@ -50,7 +54,7 @@ class Options(metrics.MotionFlags):
         ("jesse", "oppy", "dino"), "names or .toml paths, the .npz beside it", check=(len, "one or more names")
     )
     heights: tuple[float, ...] = arg((1.45, 1.6, MIDDLE, 1.9, 2.0), "statures of the users [m]", check=STATURES)
-    as_is: bool = arg(False, "the users as they were recorded, one row")
+    by: str = arg("height", "what the users differ by", choices=("height", "pace", "crossing", "none"))
     split: str = arg("validation", "which part", choices=("train", "validation", "style", "body"))
     half: str = arg("report", "which captures, as metrics.py: select, report, both", choices=tuple(metrics.HALVES))
     json: str | None = arg(None, "write the table here")
@@ -70,16 +74,37 @@ def of_build(clip, height, trunk=1.0, arms=1.0):
     return resize(shaped, (EYES * height - above) / (headset_height(shaped) - above))
 
 
+def crossed(clip, other):
+    r"""The legs of one under the trunk, head and arms of another, cut to the shorter.
+
+    Equation  R' = P R, p' = p_pelvis + P (p − q_pelvis) with P = R_pelvis Q_pelvisᵀ, for all above the pelvis; Q, q:
+              the other's; no joint turns otherwise than one of the two turned it
+    Why       §6: nothing above tells of these legs, as nothing in a wave tells how one walks
+    Test      tests/extras/test_users.py::test_crossed"""
+    n = min(len(clip), len(other))
+    clip, other = clip[:n], other[:n]
+    turn, pos, quat = quat_mul(clip.quat[:, :1], quat_conj(other.quat[:, :1])), clip.pos.copy(), clip.quat.copy()
+    quat[:, UPPER] = quat_mul(turn, other.quat[:, UPPER])
+    pos[:, UPPER] = clip.pos[:, :1] + quat_rotate(turn, other.pos[:, UPPER] - other.pos[:, :1])
+    return replace(clip, name=f"{clip.name}-under-{other.name}", pos=pos, quat=quat)
+
+
 def users(opt: Options) -> dict:
-    """Row name -> function of a clip: who plays it.  Test: tests/extras/test_users.py::test_rows"""
-    if opt.as_is:
-        return {"as recorded": lambda clip: clip}
+    """Row name -> function of the captures: who plays them.  Test: tests/extras/test_users.py::test_rows"""
+    rows = {"as recorded": list}
+    if opt.by == "none":
+        return rows
+    if opt.by == "crossing":  # ASSUMED: the other is half the captures on, of another kind where they are in order
+        return rows | {"crossed": lambda clips: list(map(crossed, clips, clips[len(clips) // 2 :] + clips))}
+    if opt.by == "pace":
+        return {f"{pace:g} of the pace": lambda clips, s=pace: [warp(c, s) for c in clips] for pace in PACES}
     rows = {}
     for height in opt.heights:
         for name, (trunk, arms) in BUILDS.items():
             if arms == 1.0 or height == MIDDLE:
                 title = f"{height:.2f} m" + (f", {name}" if name else "")
-                rows[title] = lambda clip, build=(height, trunk, arms): of_build(clip, *build)
+                build = (height, trunk, arms)
+                rows[title] = lambda clips, build=build: [of_build(c, *build) for c in clips]
     return rows
 
 
@@ -128,8 +153,8 @@ def main(argv=None):
     """Print the table.  Test: tests/extras/test_users.py::test_command"""
     argv = list(argv or [])
     opt = cli(Options, argv, "extras.users", __doc__)
-    if opt.as_is and "heights" in given_flags(argv):
-        raise UserError("--as-is leaves the users' heights as they are: leave out --heights, or --as-is")
+    if opt.by != "height" and "heights" in given_flags(argv):
+        raise UserError(f"--by {opt.by} leaves the users' heights as they are: leave out --heights, or --by")
     policies = [find_policy(metrics.Options(character=name)) for name in opt.characters]
     check_folders(opt.json, read=(*parts(opt.motion), *(path for _, path, _ in policies)))
     asked = {f.name: getattr(opt, f.name) for f in fields(metrics.MotionFlags)}
@@ -141,7 +166,7 @@ def main(argv=None):
         char, devices = load_character(own, meta, path), devices_of(meta, path, None)
         check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
         for title, played_by in users(opt).items():
-            row = row_of(char, policy.mean_action, [played_by(c) for c in captures], devices, opt.threads)
+            row = row_of(char, policy.mean_action, played_by(captures), devices, opt.threads)
             out[title := f"{metrics.name_of(char)}: {title}"] = row
             print("| " + " | ".join([title, *(cell(row[k], f) for k, f in COLUMNS.items())]) + " |", flush=True)
     if opt.json:

@@ -1,9 +1,11 @@
 """extras/users.py: builds, the rows of the table, and one row against `metrics.streamed`."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import character
 import metrics
@@ -38,14 +40,38 @@ def test_of_build(clip):
 
 
 def test_rows(clip):
-    """Every height as recorded and with a long trunk; arms at one height alone; or one row of the users as they are."""
+    """Every height as recorded and with a long trunk; arms at one height alone; or users as they are; or every pace; or
+    legs under others' trunks."""
     rows = users.users(users.Options(heights=(1.5, users.MIDDLE)))
     assert list(rows) == [
         "1.50 m", "1.50 m, long trunk", "1.75 m", "1.75 m, long trunk", "1.75 m, long arms", "1.75 m, short arms"
     ]  # fmt: skip
-    assert [round(users.stature(f(clip)), 6) for f in rows.values()] == [1.5] * 2 + [1.75] * 4
-    [(_, same)] = users.users(users.Options(as_is=True)).items()
-    assert same(clip) is clip
+    assert [round(users.stature(f([clip])[0]), 6) for f in rows.values()] == [1.5] * 2 + [1.75] * 4
+    [(_, same)] = users.users(users.Options(by="none")).items()
+    assert same([clip]) == [clip]
+    paces = users.users(users.Options(by="pace"))
+    lengths = [len(f([clip])[0]) for f in paces.values()]
+    assert list(paces)[-1] == "2 of the pace" and lengths == [79, 60, 48, 40, 30]  # 59 intervals ÷ s
+    same, cross = users.users(users.Options(by="crossing")).values()
+    names = [c.name for c in cross([replace(clip, name=n) for n in "abcde"])]
+    assert names == [f"{a}-under-{b}" for a, b in zip("abcde", "cdeab", strict=True)]
+
+
+def test_crossed(clip):
+    """Legs are one's; every joint above the pelvis, and the bones' lengths, are the other's, by SciPy."""
+    other = data.load("builtin", clips="gesture_155")[0][30:110]
+    found = users.crossed(clip, other)
+    legs = [i for i in range(len(SEG)) if i not in users.UPPER]
+    assert len(found) == 60 and len(legs) == 7
+    np.testing.assert_array_equal(found.pos[:, legs], clip.pos[:, legs])
+    np.testing.assert_array_equal(found.quat[:, legs], clip.quat[:, legs])
+    for k in (0, 33):
+        relative = []
+        for c in (found, other):
+            R = Rotation.from_quat(c.quat[k], scalar_first=True)
+            relative.append(((R[0].inv() * R).as_matrix(), R[0].inv().apply(c.pos[k] - c.pos[k, 0])))
+        for mine, theirs in zip(*relative, strict=True):
+            np.testing.assert_allclose(mine[users.UPPER], theirs[users.UPPER], atol=1e-6)
 
 
 def test_row(clip):
@@ -73,7 +99,7 @@ def test_command(clip, tmp_path, monkeypatch, capsys):
     assert "no clip matches 'swim*'" in capsys.readouterr().err
     for flags, says in (
         ("--heights 175", "from 0.5 to 2.5 metres"),
-        ("--as-is --heights 1.6", "leave out --heights, or --as-is"),
+        ("--by pace --heights 1.6", "leave out --heights, or --by"),
         ("--clips walk_105", "--half report: none of the 1 captures; valid: both, select"),
     ):
         with pytest.raises(SystemExit):
