@@ -517,15 +517,16 @@ def time_to_failure(char, ref, act, n=256, seconds=20.0, seed=0, threads=0) -> f
 
 # ------------------------------------------------------------------------------------ as a user plays it
 
-def streamed(char: Character, act, clips, devices=3, threads=0) -> dict:
+def streamed(char: Character, act, clips, devices=3, threads=0, hang=False) -> dict:
     """The row `streamed` of REPRODUCE.md's metrics: driven by sensors alone, from the default pose, with a lead-in.
 
     The errors are of all frames; after a failure the character stands up under the headset and goes on.
-    Args      act : observations (n, o) -> actions (n, u); clips : captures, each as long as it is or CAPTURE
+    Args      act : observations (n, o) -> actions (n, u); clips : captures, each as long as it is or CAPTURE;
+              hang : as `stream_of`
     Returns   as `measure`, and failures, fails_every_s, first_failure_s (median of those that fail)
     Test      tests/test_metrics.py::test_streamed
     """
-    streams = [stream_of(char, clip, devices) for clip in clips]
+    streams = [stream_of(char, clip, devices, hang) for clip in clips]
     ref = reference(char, [s[2] for s in streams])
     pos, quat = (np.concatenate([s[k] for s in streams]) for k in (0, 1))
     scale = np.concatenate([np.tile(s[3], (len(s[2]), 1)) for s in streams])
@@ -636,12 +637,12 @@ def measure_all(char, ref, policy, opt: Options, seen: Reference | None = None, 
 
     Args      captures : of the streamed row, left out without any; seen : what the policy is shown in the tracked row,
               if not ref
-
     Test      tests/test_play.py::test_measure_json"""
     rows = {}
     if captures and "streamed" in opt.rows:
         print(f"measuring streamed: {len(captures)} captures", file=sys.stderr, flush=True)
-        rows["streamed"] = streamed(char, policy.mean_action, captures, devices, opt.threads)
+        hang = opt.sensors == "hmd" and devices == 3
+        rows["streamed"] = streamed(char, policy.mean_action, captures, devices, opt.threads, hang)
     actions = {"tracked": policy_action(policy), "kinematic": None, "zero": zero_action, "pd": pd_action}
     for name, act in actions.items():
         if name in opt.rows:
@@ -679,10 +680,7 @@ def run(opt: Options) -> None:
         lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in found.items()}
         text = json.dumps(lists, indent=2) + "\n"
     else:
-        hang = opt.sensors == "hmd" and devices == 3  # no stream shows controllers that hang
-        results = measure_all(char, ref, policy, opt, seen, () if hang else captures, devices)
-        if not results:
-            raise UserError("--rows streamed: there is none with controllers that hang; leave out --sensors hmd")
+        results = measure_all(char, ref, policy, opt, seen, captures, devices)
         printed, text = report(results), as_json(results)
     if opt.json:  # first: whoever reads what is printed may not read to its end
         atomic_write(opt.json, text)
@@ -743,8 +741,10 @@ def compare(arms: list[Arm], opt: Options, captures=()) -> dict:
     Test      tests/test_play.py::test_compare"""
     out = {}
     for a in arms:
-        if "streamed" in opt.rows and captures and not (opt.sensors == "hmd" and a.devices == 3):
-            out[f"{a.path} streamed"] = streamed(a.char, a.policy.mean_action, captures, a.devices, opt.threads)
+        if "streamed" in opt.rows and captures:
+            hang = opt.sensors == "hmd" and a.devices == 3
+            row = streamed(a.char, a.policy.mean_action, captures, a.devices, opt.threads, hang)
+            out[f"{a.path} streamed"] = row
         if "tracked" in opt.rows:
             out[a.path] = measure_one(a.path, a.char, a.ref, policy_action(a.policy), opt, a.seen)
     several = {name_of(a.char): a for a in arms}

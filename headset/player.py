@@ -28,6 +28,7 @@ import numpy as np
 from character import Character, geom_lowest
 from env import BAD, FORCE_LIMIT, SUBSTEPS, fallen, observation_terms, observe, slices_of
 from headset.calibration import Stream
+from headset.losses import lose
 from headset.reader import FAR_AWAY, Sample
 from human import Clip, heading, place, quat_about, quat_matrix, quat_rotate, sensors
 from mocap.augment import begins_in_motion, lead
@@ -243,17 +244,18 @@ def recorded(clip) -> tuple[list[Sample], Clip]:
     return [Sample(k / clip.rate, pos[k], np.roll(quat[k], -1, axis=-1)) for k in range(len(led))], led
 
 
-def stream_of(char: Character, clip, devices=3):
+def stream_of(char: Character, clip, devices=3, hang=False):
     r"""What a headset's recording of a clip makes of it: poses at the control rate, and the human where they are.
 
     Method    `recorded` samples through `headset.calibration.Stream`, as a file's are; the calibrating second is not
-              played
+              played; hang : without its controllers, which then hang beside the body
     Returns   pos (T, 3, 3), quat (T, 3, 4) in the character's world; the clip in the same world, T frames; scale (3,)
     Raises    UserError: it shows no headset for a second
     Test      tests/test_metrics.py::test_streamed, tests/headset/test_stream.py::test_captures_far_away
     """
     stream = Stream(char, "mujoco", rate=clip.rate, devices=devices)
     samples, led = recorded(clip)
+    samples = lose(samples, np.ones(len(samples), bool), "hands") if hang else samples
     ticks = [tick for sample in samples for tick in stream.push(sample)]
     c = stream.calibration
     if not ticks:

@@ -16,6 +16,7 @@ import metrics
 import retarget
 from env import too_far
 from headset.player import Ride, recorded
+from headset.reader import controllers_hang
 from human import PARENTS, SEGMENTS, heading, quat_about, quat_mul
 from metrics import Recording
 from mocap.data import load
@@ -573,6 +574,10 @@ def test_streamed(char, ref):
     assert np.abs(np.sum(quat * ref.sensor_quat, axis=-1)).min() > 1 - 1e-9
     assert np.linalg.norm(pos[0, 0, :2]) < 1e-6 and abs(heading(quat[0, 0])) < 1e-6  # it begins at the origin, ahead
     assert np.linalg.norm(np.diff(pos[:13], axis=0), axis=-1).max() < 1e-9 < np.linalg.norm(pos[40] - pos[0])
+    hung, shown = metrics.stream_of(char, clip[30:130], hang=True), replace(ref, sensor_pos=pos, sensor_quat=quat)
+    shown = replace(shown, sensor_scale=np.tile(scale, (len(pos), 1)).astype(np.float32))
+    np.testing.assert_allclose(hung[0], controllers_hang(shown).sensor_pos, atol=1e-6)  # from the first tick
+    np.testing.assert_array_equal(hung[0][:, 0], pos[:, 0])
     stand = load("builtin", clips="stand_007")[0][:90]
     assert abs(len(metrics.stream_of(char, stand)[0]) - (45 + 90 - 31)) <= 1  # begins still: no speeding up
     long = load("builtin", clips="walk_005")[0]

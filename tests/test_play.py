@@ -435,6 +435,8 @@ def test_compare(two, tmp_path, capsys):
     play.main([f"--compare={two[0]},{two[1]}", "--sensors", "hmd", "--json", str(out), *more])
     hanging = json.loads(out.read_text())
     assert hanging[str(two[0])] == rows[str(two[0])] and hanging[str(two[1])] != rows[str(two[1])]
+    for path, same in ((two[0], True), (two[1], False)):
+        assert (hanging[f"{path} streamed"] == rows[f"{path} streamed"]) is same
     assert "oppy scale 0.8, 1.5k steps, controllers hang" in capsys.readouterr().out
     with pytest.raises(UserError, match="oppy.npz|jesse.npz"):
         play.main(["--compare", *map(str, two), "--sensors", "full", *more])
