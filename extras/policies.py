@@ -188,10 +188,12 @@ def ship(run, path, blend=(), share=0.5, gain=1.0, lead=0.0) -> dict:
     if experts := pairs_of(meta["options"].get("expert")):  # a policy's name, no folder of this machine
         kept["options"]["expert"] = [f"{pattern}={Path(file).name}" for pattern, file in experts]
     policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})
-    kept |= {"gain": gain} if gain != 1.0 else {}
     if lead:
         policy = led(policy, trained_as(meta, run).load(), lead, devices_of(meta, run, None))
-        kept["lead"] = lead + meta.get("lead", 0.0)
+    before = [m.get("lead", 0.0) for m in (meta, *(its for _, its in loaded))]  # in the weights, and averaged with them
+    lead += before[0] if not blend else (1.0 - share) * before[0] + share * float(np.mean(before[1:]))
+    gain *= meta.get("gain", 1.0)
+    kept |= ({"gain": gain} if gain != 1.0 else {}) | ({"lead": round(lead, 4)} if lead else {})
     if blend:
         kept["blend"] = {"with": [Path(p).name for p in blend], "share": share}
     kept |= {"licence": each_once(licences) or "MIT", "versions": versions(), "git": git_state()}

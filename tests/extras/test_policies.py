@@ -130,12 +130,13 @@ def test_blended(tmp_path):
     other = Path(ppo.__file__).parent / "characters" / "jesse-hmd.npz"
     assert load_policy(other)[1]["licence"] != "MIT"
     assert policies.ship(other, tmp_path / "again.npz")["licence"] == load_policy(other)[1]["licence"]
-    with pytest.raises(UserError, match="jesse-hmd.npz: another body or pose"):  # its shoulders' springs are stiffer
-        policies.ship(paths[1], tmp_path / "c.npz", [other])
     weights, own = load_checkpoint(other, ("policy.*",))
-    save_checkpoint(tmp_path / "small.npz", weights, own | {"options": own["options"] | {"set": None}})
+    stiff = own["options"] | {"set": "passive.stiffness.shoulder=40"}
+    save_checkpoint(tmp_path / "stiff.npz", weights, own | {"options": stiff})
+    with pytest.raises(UserError, match="stiff.npz: another body or pose"):
+        policies.ship(paths[1], tmp_path / "c.npz", [tmp_path / "stiff.npz"])
     with pytest.raises(UserError, match="blend .*: networks .*; valid: policies of one ancestor"):
-        policies.ship(paths[1], tmp_path / "c.npz", [tmp_path / "small.npz"])
+        policies.ship(paths[1], tmp_path / "c.npz", [other])
     arrays, meta = load_checkpoint(paths[0] / CHECKPOINT, ("policy.*",))
     save_checkpoint(tmp_path / "bent.npz", arrays, meta | {"options": meta["options"] | {"set": "pose.spine_y=0.2"}})
     with pytest.raises(UserError, match="bent.npz: another body or pose"):
@@ -177,11 +178,16 @@ def test_led(char, ref, devices):
 
 
 def test_led_by_command(whole, tmp_path, capsys):  # noqa: F811
-    """`ship --lead` says in the file how far ahead, and adds to what was there."""
+    """`ship --lead` says in the file how far ahead, and adds to what was there; averages and copies keep it."""
     once, twice = tmp_path / "once.npz", tmp_path / "twice.npz"
     policies.main(["ship", str(whole), str(once), "--lead", "0.05"])
     policies.main(["ship", str(once), str(twice), "--lead", "0.02"])
-    assert [round(load_policy(p)[1]["lead"], 6) for p in (once, twice)] == [0.05, 0.07]
+    told = lambda *paths: [load_policy(p)[1].get("lead", 0.0) for p in paths]  # noqa: E731
+    assert told(once, twice) == [0.05, 0.07]
+    policies.ship(once, tmp_path / "copy.npz")
+    policies.ship(once, tmp_path / "mean.npz", [whole, twice], share=0.4)
+    policies.ship(whole, tmp_path / "none.npz", [whole])
+    assert told(*(tmp_path / f"{n}.npz" for n in ("copy", "mean", "none"))) == [0.05, 0.044, 0.0]
     policy, meta = load_policy(whole)
     char = trained_as(meta, whole).load()
     np.testing.assert_allclose(load_policy(twice)[0].theta_pi, policies.led(policy, char, 0.07).theta_pi, atol=1e-5)
