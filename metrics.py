@@ -517,15 +517,16 @@ def time_to_failure(char, ref, act, n=256, seconds=20.0, seed=0, threads=0) -> f
 
 # ------------------------------------------------------------------------------------ as a user plays it
 
-def streamed(char: Character, act, clips, devices=3, threads=0, hang=False) -> dict:
+def streamed(char: Character, act, clips, devices=3, threads=0, sensors=None) -> dict:
     """The row `streamed` of REPRODUCE.md's metrics: driven by sensors alone, from the default pose, with a lead-in.
 
     The errors are of all frames; after a failure the character stands up under the headset and goes on.
     Args      act : observations (n, o) -> actions (n, u); clips : captures, each as long as it is or CAPTURE;
-              hang : as `stream_of`
+              sensors : as `shown_to`: with "hmd" the controllers of a policy of three devices hang
     Returns   as `measure`, and failures, fails_every_s, first_failure_s (median of those that fail)
     Test      tests/test_metrics.py::test_streamed
     """
+    hang = sensors == "hmd" and devices == 3
     streams = [stream_of(char, clip, devices, hang) for clip in clips]
     ref = reference(char, [s[2] for s in streams])
     pos, quat = (np.concatenate([s[k] for s in streams]) for k in (0, 1))
@@ -641,8 +642,7 @@ def measure_all(char, ref, policy, opt: Options, seen: Reference | None = None, 
     rows = {}
     if captures and "streamed" in opt.rows:
         print(f"measuring streamed: {len(captures)} captures", file=sys.stderr, flush=True)
-        hang = opt.sensors == "hmd" and devices == 3
-        rows["streamed"] = streamed(char, policy.mean_action, captures, devices, opt.threads, hang)
+        rows["streamed"] = streamed(char, policy.mean_action, captures, devices, opt.threads, opt.sensors)
     actions = {"tracked": policy_action(policy), "kinematic": None, "zero": zero_action, "pd": pd_action}
     for name, act in actions.items():
         if name in opt.rows:
@@ -742,8 +742,7 @@ def compare(arms: list[Arm], opt: Options, captures=()) -> dict:
     out = {}
     for a in arms:
         if "streamed" in opt.rows and captures:
-            hang = opt.sensors == "hmd" and a.devices == 3
-            row = streamed(a.char, a.policy.mean_action, captures, a.devices, opt.threads, hang)
+            row = streamed(a.char, a.policy.mean_action, captures, a.devices, opt.threads, opt.sensors)
             out[f"{a.path} streamed"] = row
         if "tracked" in opt.rows:
             out[a.path] = measure_one(a.path, a.char, a.ref, policy_action(a.policy), opt, a.seen)

@@ -91,11 +91,11 @@ def crossed(clip, other):
 
 def users(opt: Options) -> dict:
     """Row name -> function of the captures: who plays them.  Test: tests/extras/test_users.py::test_rows"""
-    rows = {"as recorded": list}
+    recorded = {"as recorded": list}
     if opt.by == "none":
-        return rows
+        return recorded
     if opt.by == "crossing":  # ASSUMED: the other is half the captures on, of another kind where they are in order
-        return rows | {"crossed": lambda clips: list(map(crossed, clips, clips[len(clips) // 2 :] + clips))}
+        return recorded | {"crossed": lambda clips: list(map(crossed, clips, clips[len(clips) // 2 :] + clips))}
     if opt.by == "pace":
         return {f"{pace:g} of the pace": lambda clips, s=pace: [warp(c, s) for c in clips] for pace in PACES}
     rows = {}

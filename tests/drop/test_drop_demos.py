@@ -230,15 +230,16 @@ def who_is_not_dragged(dodging):
     assert r["end"] == "upright" and r["slide"] < 0.22 and r["wrench"] < 30
 
 
-def test_a_dodger_with_the_learned_prior_is_not_dragged(all_clips, monkeypatch):
-    """With targets that jumped he slid at 0.3 m/s under a root wrench of 37 N.
+def test_a_dodger_with_the_learned_prior_stays_on_his_feet(all_clips, monkeypatch):
+    """With targets that jumped he fell in two of four takes, or slid at 0.3 m/s under a root wrench of 37 N.
 
-    Nothing is said of falls: of seeds 200 to 211 he falls in four, and which four the last bit of a sum decides."""
+    Of seeds 200 to 211 he falls in four; the last bit of a sum decides which, so conftest.py fixes BLAS's threads."""
     monkeypatch.setattr(all_clips, "general", VaePrior(load_networks()[0]))
     monkeypatch.setattr(all_clips.opt, "prior", "vae")
-    takes = [demos.projectiles(all_clips, np.random.default_rng(200 + k), (True,))[0] for k in range(3)]
+    takes = [demos.projectiles(all_clips, np.random.default_rng(200 + k), (True,))[0] for k in range(4)]
     rows = [demos.measure(take)[0] for take in takes]
     assert np.mean([numbers(take.notes["balls that hit"])[0] for take in takes]) < 4  # of 6, which hit a walker
+    assert sum(r["end"] == "fell" for r in rows) <= 1
     assert np.mean([r["slide"] for r in rows]) < 0.18 and np.mean([r["wrench"] for r in rows]) < 30
 
 
