@@ -24,18 +24,9 @@ import numpy as np
 import mocap.data
 from character import Character, OwnShapes, Switches, driven_groups
 from env import EPISODE_STEPS, SENSORS, Env, headset_only
-from headset.player import ride, stream_of
+from headset.player import AWAY, ride, stream_of
 from headset.reader import controllers_hang
-from human import (
-    CONTACT_SPEED,
-    angular_velocity,
-    heading,
-    quat_angle,
-    quat_conj,
-    quat_mul,
-    quat_rotate,
-    travelled,
-)
+from human import CONTACT_SPEED, angular_velocity, heading, quat_angle, quat_conj, quat_mul, quat_rotate, travelled
 from human import footfalls as footfalls_apart
 from mocap import yardsticks
 from mocap.augment import resize
@@ -245,6 +236,7 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
 
 COLUMNS = (  # key, heading, format
     ("completed", "completed", "{:.2f}"),
+    ("within_1m", "within 1 m", "{:.2f}"),
     ("survival", "survival", "{:.2f}"),
     ("fails_every_s", "fails every s", "{:.2f}"),
     ("first_failure_s", "first fails s", "{:.2f}"),
@@ -304,7 +296,8 @@ def report(results: dict, layout=table) -> str:
     human = next((v for k, v in results.items() if k.startswith("kinematic")), [*results.values()][-1])  # every frame
     jitter, pace = cell(human["human_jitter_m_s3"], "{:.0f}"), cell(human["human_steps_per_m"], "{:.2f}")
     line = f"the human: jitter {jitter} m/s³, {pace} steps/m; {human['clips']} sequences"
-    return "\n\n".join([layout(results), layout(results, FIELD), line])
+    beside = [c for c in COLUMNS if c[0] in ("completed", "survival")]  # of whom the errors are
+    return "\n\n".join([layout(results), layout(results, [*beside, *FIELD]), line])
 
 
 def cells(name, row, columns=COLUMNS) -> list[str]:
@@ -523,7 +516,7 @@ def streamed(char: Character, act, clips, devices=3, threads=0, sensors=None) ->
     The errors are of all frames; after a failure the character stands up under the headset and goes on.
     Args      act : observations (n, o) -> actions (n, u); clips : captures, each as long as it is or CAPTURE;
               sensors : as `shown_to`: with "hmd" the controllers of a policy of three devices hang
-    Returns   as `measure`, and failures, fails_every_s, first_failure_s (median of those that fail)
+    Returns   as `measure`, failures, fails_every_s, first_failure_s (median), within_1m (its own headset's, too)
     Test      tests/test_metrics.py::test_streamed
     """
     hang = sensors == "hmd" and devices == 3
@@ -546,6 +539,7 @@ def streamed(char: Character, act, clips, devices=3, threads=0, sensors=None) ->
     return row | whole | {
         "clips": len(clips),
         "completed": float(np.mean(~failed)),
+        "within_1m": float(np.mean([r.failures == 0 and r.farthest <= AWAY for r in rides])),
         "survival": float(np.mean(np.array(first) / ticks)),
         "failures": failures,
         "fails_every_s": ticks.sum() / ref.rate / failures if failures else float("inf"),
@@ -656,7 +650,8 @@ def measure_one(name, char, ref, act, opt: Options, seen: Reference | None = Non
     Test      tests/test_play.py::test_measure_json, test_headset_only"""
     print(f"measuring {name}: {len(ref.names)} sequences", file=sys.stderr, flush=True)
     seen = seen or ref
-    row = measure(char, ref, simulate(char, seen, act, threads=opt.threads) if act else kinematic(char, ref))
+    given = ref if seen.sensor_pos.shape[1] < 3 else replace(ref, sensor_pos=seen.sensor_pos)  # hands that hang, too
+    row = measure(char, given, simulate(char, seen, act, threads=opt.threads) if act else kinematic(char, ref))
     if act and opt.random_starts:
         row["fails_every_s"] = time_to_failure(char, seen, act, opt.random_starts, seed=opt.seed, threads=opt.threads)
     return row
@@ -706,6 +701,7 @@ class Arm:
         options, parts = self.meta.get("options", {}), [name_of(self.char)]
         parts += [f"{fmt_count(steps)} steps"] if (steps := total_steps(self.meta)) else []
         parts += [f"without {' '.join(map(str, options['without']))}"] if options.get("without") else []
+        parts += [f"carried over from {of}, not trained since"] if (of := self.meta.get("carried")) else []
         parts += ["root tracked only"] if options.get("track") == "root" else []
         if sensors_of(self.meta, self.path) == "hmd":
             parts.append("headset only")
@@ -745,7 +741,7 @@ def compare(arms: list[Arm], opt: Options, captures=()) -> dict:
             row = streamed(a.char, a.policy.mean_action, captures, a.devices, opt.threads, opt.sensors)
             out[f"{a.path} streamed"] = row
         if "tracked" in opt.rows:
-            out[a.path] = measure_one(a.path, a.char, a.ref, policy_action(a.policy), opt, a.seen)
+            out[f"{a.path} tracked"] = measure_one(a.path, a.char, a.ref, policy_action(a.policy), opt, a.seen)
     several = {name_of(a.char): a for a in arms}
     for name, a in several.items():
         label = f"kinematic {name}" if len(several) > 1 else "kinematic"

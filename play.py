@@ -62,7 +62,8 @@ FIGURES = {  # of the paper: the policies in characters/ that it puts side by si
     6: ("dino", "dino-orientation"),  # with the orientation reward, and without it
     8: ("dino", "dino-passive", "dino-fixed"),  # the tail: two joints driven, none driven, six welded
 }
-OF_FIGURE = "completed root_cm head_deg head_wobble_deg_s contact_agreement foot_slide_cm_s steps_per_m".split()
+OF_FIGURE = {"completed", "survival", "root_cm", "head_deg", "head_wobble_deg_s", "contact_agreement"}
+OF_FIGURE |= {"foot_slide_cm_s", "steps_per_m"}
 
 
 @dataclass
@@ -75,7 +76,7 @@ class Options(retarget.BvhFlags, StreamFlags, metrics.Options):
         None, "how much of it to show: 10 s by default, all of a stream or in a BVH", check=POSITIVE
     )
     every: float | None = arg(
-        None, "seconds between the pictures of the contact sheet: 0.5; with --compare eight pictures", check=POSITIVE
+        None, "seconds between the pictures of the contact sheet: 0.5, or 60 pictures; --compare: 8", check=POSITIVE
     )
     png: str | None = arg(None, "write a contact sheet", check=PNG)
     video: str | None = arg(None, "write a video (.mp4; needs the extra `view`)")
@@ -92,6 +93,7 @@ class Options(retarget.BvhFlags, StreamFlags, metrics.Options):
 # ------------------------------------------------------------------------------------ looking
 
 PICTURES = 8  # a row of the figure, unless --every says otherwise
+MANY = 60  # pictures of a sheet at most, likewise
 
 
 def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320), numbers=None):
@@ -348,7 +350,7 @@ def play_figure(opt: Options) -> None:
     clip = chosen(long, opt)
     arms, columns = metrics.arms_of([clip], opt), [c for c in metrics.COLUMNS if c[0] in OF_FIGURE]
     rows = {a.path: metrics.streamed(a.char, a.policy.mean_action, [clip], a.devices, opt.threads) for a in arms}
-    print(*(a.title() for a in arms), metrics.comparison(rows, columns), sep="\n")
+    print(*(a.title() for a in arms), "streamed", metrics.comparison(rows, columns), sep="\n")
     cells = {path: zip(columns, metrics.cells("", row, columns)) for path, row in rows.items()}
     numbers = {path: "  ".join(f"{head} {text}" for (_, head, _), text in pairs) for path, pairs in cells.items()}
     numbers = {path: text.replace("°", "deg").replace("³", "3") for path, text in numbers.items()}  # the font's letters
@@ -431,7 +433,8 @@ def follow(char: Character, policy, path, devices: int, opt, see, pace: Pace | N
     if source.calibration is None:
         raise UserError(f"{reader.name}: {source.uncalibrated()}")
     unreadable = [f"{reader.unreadable} lines could not be read"] if reader.unreadable else []
-    print(*source.report(), *unreadable, *player.report(), *(pace.report() if pace else []), sep="\n", flush=True)
+    told = player.report(controllers=read == 3)
+    print(*source.report(), *unreadable, *told, *(pace.report() if pace else []), sep="\n", flush=True)
     if broken:
         raise broken
 
@@ -486,7 +489,8 @@ def _write_pictures(char, ref, recording, last, opt):
     from plumbing import render
 
     if opt.png:
-        frames = np.arange(0, last + 1, max(1, round((opt.every or 0.5) * CONTROL_RATE)))
+        every = opt.every or max(0.5, last / CONTROL_RATE / MANY)
+        frames = np.arange(0, last + 1, max(1, round(every * CONTROL_RATE)))
         labels = [f"{t / CONTROL_RATE:.1f} s" for t in frames]
         render.write_png(opt.png, render.contact_sheet(pictures(char, ref, recording, frames), labels, 5))
         print(opt.png)
@@ -618,8 +622,8 @@ def check_source(opt: StreamFlags, argv) -> None:
     Test      tests/robustness/test_cli.py::test_play_flags_that_would_do_nothing"""
     if wrong := given_flags(argv) & (OF_MOTION if opt.stream else OF_STREAM):
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(wrong))
-        says = "are of a motion, and --stream has none" if opt.stream else "are of --stream FILE"
-        raise UserError(f"{flags} {says}: leave out the one or the other")
+        says = "of a motion, and --stream has none" if opt.stream else "of --stream FILE"
+        raise UserError(f"{flags} {'are' if len(wrong) > 1 else 'is'} {says}: leave out the one or the other")
 
 
 def check_given(opt: Options, given) -> None:

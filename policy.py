@@ -166,8 +166,13 @@ def check_exact(policy: Policy, meta, path, opt, env):
     if own and Path(own.character).stem != Path(opt.character).stem:
         odd = [f"it is {Path(own.character).stem}'s", *odd]
     if odd:
-        make = f"python -m extras.policies carry {path} NEW.npz --character {opt.character}"
+        make = carried_by(path, opt.character)
         raise UserError(f"{path}: does not fit {env.name}: {'; '.join(odd)}; this makes one that does: {make}")
+
+
+def carried_by(path, character) -> str:
+    """The command that makes a policy fit a character.  Test: tests/test_ppo.py::test_init_points_to_carry"""
+    return f"python -m extras.policies carry {path} NEW.npz --character {character}"
 
 
 def initial(path, opt, env) -> tuple[Policy, int]:
@@ -183,11 +188,16 @@ def initial(path, opt, env) -> tuple[Policy, int]:
     return policy, total_steps(meta)
 
 
-def widths(path) -> dict:
+def widths(path, character) -> dict:
     """The hidden layers of a policy's two networks, by the names of the options.
 
-    Test      tests/test_ppo.py::test_init_brings_its_widths"""
-    policy, _ = load_policy(path)
+    Raises    UserError: it is another character's, which is said here, before motions are read
+    Test      tests/test_ppo.py::test_init_brings_its_widths, test_init_points_to_carry"""
+    policy, meta = load_policy(path)
+    own = trained_as(meta, path)
+    if own and Path(own.character).stem != Path(character).stem:
+        stem, make = Path(own.character).stem, carried_by(path, character)
+        raise UserError(f"{path}: does not fit {character}: it is {stem}'s; this makes one that does: {make}")
     return {"hidden": policy.hidden, "value_hidden": policy.value_hidden}
 
 

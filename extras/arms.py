@@ -124,7 +124,7 @@ CLAIMS = (
 
 COLUMNS = tuple(
     c
-    for key in "survival fails_every_s root_cm head_deg head_wobble_deg_s joint_rot_deg contact_agreement "
+    for key in "completed survival fails_every_s root_cm head_deg head_wobble_deg_s joint_rot_deg contact_agreement "
     "foot_slide_cm_s own_slide_cm_s jitter_m_s3 steps_per_m torque_rms".split()
     for c in metrics.COLUMNS
     if c[0] == key
@@ -216,13 +216,14 @@ def pieces(ref: Reference, seconds, most) -> Reference:
     return Reference(names, ref.rate, first, first + n, **cut, still=np.zeros(len(k), int))
 
 
-def measured(char: Character, ref: Reference, act, threads) -> dict:
-    """Every metric of a policy on pieces, tracked; `fails_every_s` is of them, too.  act None: the kinematic pose
+def measured(char: Character, ref: Reference, act, threads, seen: Reference | None = None) -> dict:
+    """Every metric of a policy on pieces, tracked; `fails_every_s` is of them, too.
 
-    Test      tests/extras/test_arms.py::test_table"""
-    found = metrics.simulate(char, ref, act, threads=threads) if act else metrics.kinematic(char, ref)
+    Args      act : None: the kinematic pose; seen : what the policy is shown, by default ref, against which all is held
+    Test      tests/extras/test_arms.py::test_table, test_headset_arm_is_held_against_the_user"""
+    found = metrics.simulate(char, seen or ref, act, threads=threads) if act else metrics.kinematic(char, ref)
     row, failures = metrics.measure(char, ref, found), sum(r.failed for r in found)
-    lived = sum(len(r.frames) - 1 for r in found) / ref.rate
+    lived = sum(len(r.frames) - 1 + r.failed for r in found) / ref.rate  # the failing step, too, as everywhere
     return row | {"fails_every_s": lived / failures if failures else float("inf")}
 
 
@@ -252,9 +253,10 @@ class Measuring:
         if (name, of) not in self.rows:
             policy, meta = load_policy(folder)
             char = trained_as(meta, folder).load()
-            ref = metrics.shown_to(meta, folder, self.ref(char, of), None)
-            check_fits(policy, Env(char, ref, 1), folder)
-            row = measured(char, ref, metrics.policy_action(policy), self.opt.threads)
+            ref = self.ref(char, of)
+            seen = metrics.shown_to(meta, folder, ref, None)
+            check_fits(policy, Env(char, seen, 1), folder)
+            row = measured(char, ref, metrics.policy_action(policy), self.opt.threads, seen)
             self.rows[name, of] = row | {"steps": meta["steps"]}
         return self.rows[name, of]
 
@@ -307,7 +309,7 @@ def table(opt: Options) -> dict:
             if not rows:
                 continue
             n = next(r["clips"] for r in rows.values() if r)
-            print(f"\n{claim.title}; {of}: {n} pieces of {opt.seconds:g} s, seed {opt.seed}\n")
+            print(f"\n{claim.title}; {of}, tracked: {n} pieces of {opt.seconds:g} s, seed {opt.seed}\n")
             head = ["arm", "steps", *(h for _, h, _ in COLUMNS)]
             print(markdown([head, *(line_of(name, row) for name, row in rows.items())]))
             print(*unequal(rows), sep="\n", end="\n" if unequal(rows) else "", flush=True)

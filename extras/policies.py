@@ -194,6 +194,7 @@ def ship(run, path, blend=(), share=0.5, gain=1.0, lead=0.0) -> dict:
     lead += before[0] if not blend else (1.0 - share) * before[0] + share * float(np.mean(before[1:]))
     gain *= meta.get("gain", 1.0)
     kept |= ({"gain": gain} if gain != 1.0 else {}) | ({"lead": round(lead, 4)} if lead else {})
+    kept |= {k: meta[k] for k in ("carried", "blend") if k in meta}
     if blend:
         kept["blend"] = {"with": [Path(p).name for p in blend], "share": share}
     kept |= {"licence": each_once(licences) or "MIT", "versions": versions(), "git": git_state()}
@@ -413,6 +414,14 @@ def carry(old_path, new_path, opt: Carry, given=()) -> dict:
     return kept
 
 
+def check_new(out) -> None:
+    """UserError: a policy is there already.  `blend` names OUT first: a slip of order would cost one of the averaged.
+
+    Test      tests/extras/test_policies.py::test_nothing_is_overwritten"""
+    if Path(out).exists():
+        raise UserError(f"{out} exists already: valid: the name of a new file (of blend it stands first)")
+
+
 WORDS = {"ship": (2, 2), "carry": (2, 2), "blend": (3, 100)}  # how many files each command wants, least and most
 
 
@@ -428,6 +437,7 @@ def main(argv=None):
     if what == "carry":
         opt = cli(Carry, flags, "extras.policies carry OLD.npz NEW.npz", __doc__)
         check_folders(files[1], read=files[:1])
+        check_new(files[1])
         meta = carry(*files, opt, given_flags(flags))
         print(f"{files[1]}: {meta['options']['character']}, {fmt_count(meta['steps'])} steps before")
         return
@@ -436,6 +446,7 @@ def main(argv=None):
         raise UserError("--share is of blend OUT.npz A B …: leave it out")
     run, out, *others = files if what == "ship" else [files[1], files[0], *files[2:]]
     check_folders(out, read=[run, *others])
+    check_new(out)
     meta = ship(run, out, others, opt.share, opt.gain, opt.lead)
     mixed = f", {1 - opt.share:g} of it and {opt.share:g} of {', '.join(others)}" if others else ""
     print(f"{out}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}{mixed}; {meta['licence']}")

@@ -39,6 +39,7 @@ from retarget import HEADSET_AHEAD, STAGE_VEL, standing
 # ------------------------------------------------------------------------------------ the character
 
 AWAY = 1.0  # m, horizontally from the user's headset to HEADSET_AHEAD before the root: it has lost the user.  ASSUMED
+# Its own headset would charge it with its build (Dino's is 0.24 m farther ahead): `Ride.farthest` has that distance
 
 
 class Player:
@@ -74,7 +75,7 @@ class Player:
         self.contact = np.zeros((n, 2), bool)  # feet that pressed on the floor at the end of the step
         self.ticks = np.zeros(n, int)
         self.ends = [Counter() for _ in range(n)]
-        self.head_error, self.hand_error = np.zeros(n), np.zeros(n)  # sums [m]
+        self.head_error, self.hand_error, self.farthest = np.zeros((3, n))  # sums; the headset's greatest error [m]
         self.latency = deque(maxlen=100_000)  # (to the torque, to the new state) [s]
 
     def stand(self, pos, quat, ids=None):
@@ -104,6 +105,7 @@ class Player:
             self.before = now
         error = np.linalg.norm(self.site_xpos[:, self.char.sensor_sites] - pos, axis=-1)  # (n, 3)
         self.head_error += error[:, 0] * playing
+        self.farthest = np.fmax(self.farthest, error[:, 0] * playing)
         self.hand_error += error[:, 1:].mean(axis=1) * playing  # not reported where there are no controllers
         observe(self, slice(None), self.before, now, self.obs)
         action = self.act(self.obs)
@@ -142,8 +144,10 @@ class Player:
         """How often each had to stand anew.  (n,) int"""
         return np.array([sum(ends.values()) for ends in self.ends])
 
-    def report(self) -> list[str]:
-        """Falls, errors, latency.  Test: tests/headset/test_stream.py::test_falls_are_counted"""
+    def report(self, controllers=True) -> list[str]:
+        """Falls, errors, latency.  controllers : were they the user's?  Those that hang have no errors to tell of
+
+        Test      tests/headset/test_stream.py::test_falls_are_counted"""
         ticks = self.ticks.sum()
         if not ticks:
             return ["0 s played"]
@@ -151,7 +155,8 @@ class Player:
         counts = f"{ends['fall']} falls, {ends['away']} times lost the user, {ends['bad']} diverged"
         every = f"one every {seconds / n:.1f} s" if n else "none"
         torque, state = (1000 * np.percentile(k, [50, 99]) for k in np.array(self.latency).T)
-        hands = f"hand error {100 * self.hand_error.sum() / ticks:.1f} cm, " if self.devices == 3 else ""
+        hands = f"hand error {100 * self.hand_error.sum() / ticks:.1f} cm, "
+        hands = hands if controllers and self.devices == 3 else ""
         return [
             f"{seconds:.1f} s played: {counts} ({every})",
             f"head error {100 * self.head_error.sum() / ticks:.1f} cm, {hands}mean over all ticks",
@@ -165,7 +170,8 @@ class Ride:
     """What a character did under one stream, from its first tick to its last.
 
     qpos (T, nq), contact (T, 2) bool and action (T, u) belong to the tick whose poses the character was given; anew
-    (T,) says where it had just been stood up, the start included; ends counts why; head, hands : sums of errors [m]
+    (T,) says where it had just been stood up, the start included; ends counts why; head, hands : sums of errors [m];
+    farthest : the headset's greatest error [m]
     """
 
     qpos: np.ndarray
@@ -175,6 +181,7 @@ class Ride:
     ends: Counter
     head: float
     hands: float
+    farthest: float
 
     @property
     def failures(self):
@@ -222,7 +229,7 @@ def _ride(char, act, streams, devices, threads) -> list[Ride]:
     qpos, contact, action, anew = (np.stack(a[: lengths.max()], axis=1) for a in (qpos, contact, action, anew))
     return [
         Ride(qpos[i, :k], contact[i, :k], action[i, :k], anew[i, :k], player.ends[i], *errors)
-        for i, (k, *errors) in enumerate(zip(lengths, player.head_error, player.hand_error))
+        for i, (k, *errors) in enumerate(zip(lengths, player.head_error, player.hand_error, player.farthest))
     ]
 
 

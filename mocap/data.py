@@ -257,7 +257,7 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
         found = sorted({part for _, part, _ in matching})
         raise UserError(
             f"{motion}: none of the {len(matching)} clips that match {clips!r} is in split {split!r}; "
-            f"they are in {' and '.join(found)}"
+            f"they are in {' and '.join(found)} (--split)"
         )
     if motion in BUILTIN:
         return chosen

@@ -24,7 +24,7 @@ def read_options(kind, argv, prog, description, widths=None):
     """The options of a new run, or of the one to resume.
 
     Args      kind : a dataclass that is a `character.Switches` with out, resume, init and recipe; argv : list of str
-              widths : of the policy of --init, path -> {option: value}, where the command line does not say
+              widths : of --init's policy, (path, character) -> {option: value}, where the command line does not say
     Raises    UserError: a run is there already, or none to resume; the recipe holds what `kind` has not
     Test      tests/test_ppo.py::test_recipe, test_resume_refuses_other_options, test_init_brings_its_widths
     """
@@ -42,7 +42,7 @@ def read_options(kind, argv, prog, description, widths=None):
             'valid: by = "extras.train", which has it, or --recipe none'
         )
     if opt.init and widths:
-        recipe |= widths(opt.init)
+        recipe |= widths(opt.init, opt.character)
     return dataclasses.replace(opt, **{k: v for k, v in recipe.items() if k not in given})
 
 

@@ -29,6 +29,7 @@ KEYS = (  # spec: every key of every row
     "torque_rms saturation own_slide_cm_s self_penetration_mm self_penetration_share spring_share"
 ).split()
 FIELD = [k for k, *_ in metrics.FIELD]
+BESIDE = [*(c for c in metrics.COLUMNS if c[0] in ("completed", "survival")), *metrics.FIELD]  # and who they are of
 GROUPS = [f"spring_share.{g}" for g in ("ankle", "elbow", "head", "hip", "knee", "neck", "shoulder", "spine")]
 KEYS += GROUPS
 
@@ -477,13 +478,14 @@ def test_table(char, ref):
     rows = {"policy": row | {"fails_every_s": float("inf")}, "kinematic": row}
     text = metrics.report(rows)
     ours, field, _ = text.split("\n\n")
-    assert ours == metrics.table(rows) and field == metrics.table(rows, metrics.FIELD)
-    assert [c.strip() for c in field.splitlines()[3].split("|")][1:3] == ["kinematic", f"{row['mpjpe_cm']:.1f}"]
+    assert ours == metrics.table(rows) and field == metrics.table(rows, BESIDE)
+    found = [c.strip() for c in field.splitlines()[3].split("|")]
+    assert found[1:5] == ["kinematic", "-", "-", f"{row['mpjpe_cm']:.1f}"]
     lines = text.splitlines()
     width = len(metrics.COLUMNS) + 1
     assert [line.count("|") for line in lines[:4]] == [width + 1] * 4
     cells = [c.strip() for c in lines[3].split("|")]
-    assert cells[1:4] == ["kinematic", "-", "-"] and cells[4 + 2] == "0.0"  # completed by definition: a dash
+    assert cells[1:5] == ["kinematic", "-", "-", "-"] and cells[5 + 2] == "0.0"  # completed by definition: a dash
     assert "never" in lines[2] and "the human: jitter" in text and "3 sequences" in text
 
 
@@ -496,9 +498,9 @@ def test_comparison(char, ref):
     assert found[0] == ["", "runs/a", "b.npz", "kinematic jesse"]
     found, turned = (np.array([r for r in g if r[0] != "---"]) for g in (found, turned))
     np.testing.assert_array_equal(found, turned.T)
-    assert found[3].tolist() == ["fails every s", "never", "-", "-"] and found[4, 0] == "first fails s"
+    assert found[4].tolist() == ["fails every s", "never", "-", "-"] and found[5, 0] == "first fails s"
     ours, field, line = metrics.report(results, metrics.comparison).split("\n\n")
-    assert ours == metrics.comparison(results) and field == metrics.comparison(results, metrics.FIELD)
+    assert ours == metrics.comparison(results) and field == metrics.comparison(results, BESIDE)
     assert line == metrics.report(results).splitlines()[-1]
 
 
@@ -612,13 +614,14 @@ def test_streamed_row_of_known_rides(char, monkeypatch):
         t = last - start + 1
         contact, action = rng.random((t, 2)) < 0.5, rng.uniform(-1, 1, (t, len(char.limits)))
         anew = np.isin(np.arange(t), stood)
-        ends = Counter(fall=len(stood) - 1)
-        rides.append(Ride(seen.qpos[start : last + 1].copy(), contact, action, anew, ends, 0.0, 0.0))
+        ends, far = Counter(fall=len(stood) - 1), 0.7 if len(stood) == 2 else 1.2
+        rides.append(Ride(seen.qpos[start : last + 1].copy(), contact, action, anew, ends, 0.0, 0.0, far))
     monkeypatch.setattr(metrics, "ride", lambda *args: rides)
     row = metrics.streamed(char, None, clips)
 
     lengths = [len(s[0]) for s in streams]
     assert (row["clips"], row["failures"]) == (3, 3) and row["completed"] == pytest.approx(1 / 3)
+    assert row["within_1m"] == 0.0  # who completes was 1.2 m off once; who was near failed
     assert row["survival"] == pytest.approx((1 + 40 / lengths[1] + 10 / lengths[2]) / 3)
     assert row["first_failure_s"] == pytest.approx(25 / 30) and row["fails_every_s"] == pytest.approx(
         sum(lengths) / 30 / 3

@@ -228,7 +228,7 @@ def test_measure_json(policy_file, tmp_path, capsys, monkeypatch):
     rows = json.loads(out.read_text(), parse_constant=lambda c: pytest.fail(f"{c} is not JSON"))
     assert list(rows) == ["streamed", "tracked", "kinematic", "zero", "pd"]
     for name, row in rows.items():
-        assert set(COLUMNS) - {"fails_every_s", "first_failure_s"} <= set(row), name
+        assert set(COLUMNS) - {"fails_every_s", "first_failure_s", "within_1m"} <= set(row), name
         assert ("fails_every_s" in row) == (name != "kinematic")
         assert all(v is None or isinstance(v, int | float) for v in row.values())
         assert f"| {name} |" in text
@@ -331,7 +331,7 @@ def test_what_is_read_is_not_overwritten(policy_file, tmp_path):
         ("--measure --port 8080", "--port says something of --view web alone"),
         ("--stream x.csv --port 8080", "--port says something of --view web alone"),
         ("--stream x.csv --every 1", "--every says something of --png alone"),
-        ("--stream x.csv --seed 1", "--seed are of a motion, and --stream has none"),
+        ("--stream x.csv --seed 1", "--seed is of a motion, and --stream has none"),
         ("--figure 5 --half report", "--figure 5: has its own policies, streamed: leave out --half"),
     ],
 )
@@ -391,6 +391,11 @@ def test_headset_only(char, ref, tmp_path):
     again = metrics.measure(char, ref, metrics.simulate(char, less, metrics.policy_action(policy), threads=1))
     assert row == pytest.approx(again, nan_ok=True)
     assert row["hands_cm"] > 1.0  # to the user's hands, which it was not shown
+    hang = controllers_hang(ref)
+    hung = metrics.measure_one("zero", char, ref, metrics.zero_action, opt, hang)
+    assert hung["hands_cm"] != metrics.measure_one("zero", char, ref, metrics.zero_action, opt)["hands_cm"]
+    given = metrics.measure(char, hang, metrics.simulate(char, ref, metrics.zero_action, threads=1))
+    assert hung["hands_cm"] == pytest.approx(given["hands_cm"])  # to the hands it was shown, which hang
     rows = metrics.measure_all(char, ref, policy, opt, less)
     assert rows["tracked"] == pytest.approx(row, nan_ok=True) and list(rows) == ["tracked", "kinematic", "zero", "pd"]
 
@@ -420,23 +425,23 @@ def test_compare(two, tmp_path, capsys):
     play.main(["--compare", *map(str, two), "--json", str(out), *more])
     text = capsys.readouterr().out
     rows = json.loads(out.read_text())
-    policies = [name for path in two for name in (f"{path} streamed", str(path))]
+    policies = [name for path in two for name in (f"{path} streamed", f"{path} tracked")]
     assert list(rows) == [*policies, "kinematic jesse", "kinematic oppy scale 0.8"]
     assert f"{two[0]}: jesse, 1.5k steps, without contact, headset only" in text
     assert f"{two[1]}: oppy scale 0.8, 1.5k steps\n" in text
     lines = [line for line in text.splitlines() if line.startswith("|")]
     assert lines[0].split("|")[2:6] == [f" {p} " for p in policies]
-    assert len(lines) == len(COLUMNS) + 2 + len(metrics.FIELD) + 2
+    assert len(lines) == len(COLUMNS) + 2 + 2 + len(metrics.FIELD) + 2
     for path in two:
         play.main(["--policy", str(path), "--measure", "--json", str(out), *more])
         alone = json.loads(out.read_text())
-        assert alone["tracked"] == rows[str(path)] and alone["streamed"] == rows[f"{path} streamed"]
+        assert alone["tracked"] == rows[f"{path} tracked"] and alone["streamed"] == rows[f"{path} streamed"]
     assert alone["kinematic"] == rows["kinematic oppy scale 0.8"]
     play.main([f"--compare={two[0]},{two[1]}", "--sensors", "hmd", "--json", str(out), *more])
     hanging = json.loads(out.read_text())
-    assert hanging[str(two[0])] == rows[str(two[0])] and hanging[str(two[1])] != rows[str(two[1])]
     for path, same in ((two[0], True), (two[1], False)):
-        assert (hanging[f"{path} streamed"] == rows[f"{path} streamed"]) is same
+        for name in (f"{path} streamed", f"{path} tracked"):
+            assert (hanging[name] == rows[name]) is same
     assert "oppy scale 0.8, 1.5k steps, controllers hang" in capsys.readouterr().out
     with pytest.raises(UserError, match="oppy.npz|jesse.npz"):
         play.main(["--compare", *map(str, two), "--sensors", "full", *more])

@@ -98,13 +98,21 @@ def test_curve(tmp_path):
     assert arms.curve(tmp_path / "m.csv") == {0.1: 5.0, 0.2: 2.5, 0.5: 2.5}
 
 
+def test_headset_arm_is_held_against_the_user():
+    """§4.2: what it is not shown is measured all the same: hands against the user's controllers, not its headset."""
+    char = train.Options(character="jesse").load()
+    ref = arms.pieces(arms.reference(char, data.sequences("builtin", "validation", "*walk*", verbose=False)), 1.0, 2)
+    alone = arms.measured(char, ref, metrics.zero_action, 1, env.headset_only(ref))
+    assert alone["hands_cm"] == pytest.approx(arms.measured(char, ref, metrics.zero_action, 1)["hands_cm"])
+
+
 def test_table(two, tmp_path, capsys):
     """A table of the claims whose arms were run, their baselines, and the curves; the numbers are metrics.py's."""
     capsys.readouterr()
     flags = ["--out", str(two), "--most", "6", "--seconds", "1", "--json", str(tmp_path / "t.json")]
     arms.main(["table", *flags])
     out, found = capsys.readouterr().out, json.loads((tmp_path / "t.json").read_text())
-    assert "§4.3.1 contact reward; walks: 6 pieces of 1 s" in out and "| oppy | not run |" in out
+    assert "§4.3.1 contact reward; walks, tracked: 6 pieces of 1 s" in out and "| oppy | not run |" in out
     assert "§5.1" not in out and "fails every, s, while it learns" in out
     title = "§4.3.1 contact reward; walks"
     assert {k.split("; ")[-1] for k in found if k.startswith(title)} == {
@@ -116,7 +124,8 @@ def test_table(two, tmp_path, capsys):
     ref = arms.pieces(arms.reference(char, data.sequences("builtin", "validation", "*walk*", verbose=False)), 1.0, 6)
     policy, _ = load_policy(two / "dino.0")
     again = metrics.simulate(char, ref, metrics.policy_action(policy), threads=1)
-    lived, failed = sum(len(r.frames) - 1 for r in again) / 30, sum(r.failed for r in again)
+    failed = sum(r.failed for r in again)
+    lived = (sum(len(r.frames) - 1 for r in again) + failed) / 30  # the step that failed, too
     assert row["fails_every_s"] == pytest.approx(lived / failed)
     assert row["survival"] == pytest.approx(np.mean([(len(r.frames) - 1) / 30 for r in again]))
     with pytest.raises(UserError, match="no two arms of a claim and seed 9 were run"):

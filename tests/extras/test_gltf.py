@@ -201,8 +201,8 @@ def test_command_line(tmp_path, capsys, monkeypatch):
     for args, says in (
         (["--out", str(tmp_path / "none" / "a.glb")], "cannot write .*a.glb: there is no folder"),
         (["--out", "a.gltf"], "--out a.gltf: is written as .glb"),
-        (["--stream", "s.csv", "--clips", "walk*"], "--clips are of a motion, and --stream has none"),
-        (["--axes", "unity"], "--axes are of --stream FILE"),
+        (["--stream", "s.csv", "--clips", "walk*"], "--clips is of a motion, and --stream has none"),
+        (["--axes", "unity"], "--axes is of --stream FILE"),
         (["--stream", "nothing.csv"], "nothing.csv"),
         (["--stream", str(tmp_path)], "is a folder"),
         (["--stream", "short.csv", "--axes", "unity"], "short.csv: ends with the second that calibrates"),

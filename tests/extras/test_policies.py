@@ -113,8 +113,8 @@ def test_blended(tmp_path):
         assert meta["blend"] == {"with": ["old"], "share": share}
         got = load_policy(tmp_path / "b.npz")[0]
         np.testing.assert_allclose(got.mean_action(obs), like.mean_action(obs), atol=1e-5)
-    policies.main(["blend", str(tmp_path / "b.npz"), str(paths[1]), str(paths[0]), "--share", "0.25"])
-    got = load_policy(tmp_path / "b.npz")[0]
+    policies.main(["blend", str(tmp_path / "quarter.npz"), str(paths[1]), str(paths[0]), "--share", "0.25"])
+    got = load_policy(tmp_path / "quarter.npz")[0]
     np.testing.assert_allclose(got.theta_pi, 0.75 * new.theta_pi + 0.25 * old.theta_pi, atol=1e-6)
     np.testing.assert_allclose(got.norm.var, 0.75 * new.norm.var + 0.25 * old.norm.var, rtol=1e-5)
     np.testing.assert_allclose(got.norm.mean, 0.75 * new.norm.mean + 0.25 * old.norm.mean, atol=1e-5)
@@ -175,6 +175,29 @@ def test_led(char, ref, devices):
     np.testing.assert_allclose(policies.led(policy, char, 0.07, devices).mean_action(obs), expected, atol=2e-4)
     np.testing.assert_array_equal(policy.critic.theta, critic)
     np.testing.assert_allclose(policies.led(policy, char, -0.07, devices).mean_action(obs), before, atol=2e-4)
+
+
+def test_nothing_is_overwritten(whole, tmp_path):  # noqa: F811
+    """A policy that is there stays: `blend` names the new file first, and a slip of order would cost another."""
+    a, b, c = (tmp_path / f"{n}.npz" for n in "abc")
+    for path in (a, b, c):
+        policies.ship(whole, path)
+    was = a.read_bytes()
+    for words in (["blend", a, b, c], ["ship", b, a], ["carry", b, a, "--sensors", "hmd"]):
+        with pytest.raises(UserError, match="a.npz exists already: valid: the name of a new file"):
+            policies.main([str(w) for w in words])
+    assert a.read_bytes() == was
+
+
+def test_ancestry_is_kept(whole, tmp_path):  # noqa: F811
+    """What a policy was averaged or carried over from is said by its copies, too, led or not."""
+    a, b, c = (tmp_path / f"{n}.npz" for n in "abc")
+    policies.main(["carry", str(whole), str(a), "--set", "reward.q=[0, 1]"])
+    policies.main(["ship", str(a), str(b), "--lead", "0.05"])
+    assert load_policy(b)[1]["carried"] == whole.name
+    policies.main(["blend", str(c), str(b), str(a)])
+    told = policies.ship(c, tmp_path / "d.npz")
+    assert told["carried"] == whole.name and told["blend"] == {"with": ["a.npz"], "share": 0.5}
 
 
 def test_led_by_command(whole, tmp_path, capsys):  # noqa: F811
@@ -381,10 +404,12 @@ def test_carry_command(tmp_path, capsys):
     assert (b.hidden, b.value_hidden, meta["carried"], meta["steps"]) == ((12,), (6,), "p.npz", 5)
     assert meta["licence"] == "MIT"
     saved(tmp_path, dino, init=str(character.CHARACTERS / "dino.npz"))  # not named by what is carried: its terms are
+    out.unlink()
     policies.main(args)
     terms = load_policy(character.CHARACTERS / "dino.npz")[1]["licence"]
     assert load_policy(out)[1]["licence"] == terms
     saved(tmp_path, dino, set="reward.contact=[0.5, 1.0]")
+    out.unlink()
     policies.main(["carry", str(path), str(out), "--tail", "passive", "--set", ""])
     _, meta = load_policy(out)
     assert meta["options"]["tail"] == "passive" and not meta["options"]["set"] and meta["policy"]["action_size"] == 33
@@ -392,7 +417,7 @@ def test_carry_command(tmp_path, capsys):
         carried(out, dino, dino, Carry())
     save_checkpoint(path, a.arrays(), {"policy": a.shape()})
     with pytest.raises(UserError, match="does not say of which character"):
-        policies.main(["carry", str(path), str(out)])
+        policies.main(["carry", str(path), str(tmp_path / "none.npz")])
 
 
 def test_wrong_commands(tmp_path, capsys):

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
@@ -772,6 +773,13 @@ def test_side_by_side(jesse, walk):
         assert np.array_equal(found.anew, alone.anew) and np.array_equal(found.contact, alone.contact)
         assert found.head == pytest.approx(alone.head) and found.hands == pytest.approx(alone.hands)
         assert len(found.qpos) == len(stream[0]) and found.anew.sum() in (found.failures, found.failures + 1)
+        mj = mujoco.MjData(jesse.model)
+        errors = []
+        for qpos, target in zip(found.qpos, stream[0]):
+            mj.qpos[:] = qpos
+            mujoco.mj_kinematics(jesse.model, mj)
+            errors.append(np.linalg.norm(mj.site_xpos[jesse.sensor_sites[0]] - target[0]))
+        assert found.farthest == pytest.approx(max(errors)) and found.head == pytest.approx(sum(errors))
     assert rides[0].failures > 0 and rides[0].anew[0]  # it falls, and the start counts as a stand, not as a failure
     # the contacts of a tick are those of the step before it, as Env sees them
     env = Env(jesse, ref, 1, threads=1, autoreset=False)
