@@ -160,19 +160,27 @@ def check_exact(policy: Policy, meta, path, opt, env):
 
     Args      opt : character, hidden, value_hidden of the run; env : the sizes of its observations and actions
     Test      tests/test_ppo.py::test_init_fine_tunes, test_init_points_to_carry"""
-    own, names = trained_as(meta, path), ("obs_size", "critic_size", "action_size", "hidden", "value_hidden")
+    names = ("obs_size", "critic_size", "action_size", "hidden", "value_hidden")
     need = {name: getattr(env if name.endswith("size") else opt, name) for name in names}
     odd = [f"{k} {getattr(policy, k)}, not {need[k]}" for k in names if getattr(policy, k) != need[k]]
-    if own and Path(own.character).stem != Path(opt.character).stem:
-        odd = [f"it is {Path(own.character).stem}'s", *odd]
-    if odd:
-        make = carried_by(path, opt.character)
-        raise UserError(f"{path}: does not fit {env.name}: {'; '.join(odd)}; this makes one that does: {make}")
+    if odd := [*anothers(meta, path, opt.character), *odd]:
+        raise misfit(path, opt.character, odd)
 
 
-def carried_by(path, character) -> str:
-    """The command that makes a policy fit a character.  Test: tests/test_ppo.py::test_init_points_to_carry"""
-    return f"python -m extras.policies carry {path} NEW.npz --character {character}"
+def anothers(meta, path, character) -> list[str]:
+    """What to say of a policy that is another character's; nothing where it is this one's, or names none.
+
+    Test      tests/test_ppo.py::test_init_points_to_carry"""
+    own = trained_as(meta, path)
+    return [f"it is {Path(own.character).stem}'s"] if own and Path(own.character).stem != Path(character).stem else []
+
+
+def misfit(path, character, odd) -> UserError:
+    """The error of a policy that does not fit, with the command that makes one that does.
+
+    Test      tests/test_ppo.py::test_init_points_to_carry"""
+    make = f"python -m extras.policies carry {path} NEW.npz --character {character}"
+    return UserError(f"{path}: does not fit {Path(character).stem}: {'; '.join(odd)}; this makes one that does: {make}")
 
 
 def initial(path, opt, env) -> tuple[Policy, int]:
@@ -194,10 +202,8 @@ def widths(path, character) -> dict:
     Raises    UserError: it is another character's, which is said here, before motions are read
     Test      tests/test_ppo.py::test_init_brings_its_widths, test_init_points_to_carry"""
     policy, meta = load_policy(path)
-    own = trained_as(meta, path)
-    if own and Path(own.character).stem != Path(character).stem:
-        stem, make = Path(own.character).stem, carried_by(path, character)
-        raise UserError(f"{path}: does not fit {character}: it is {stem}'s; this makes one that does: {make}")
+    if odd := anothers(meta, path, character):
+        raise misfit(path, character, odd)
     return {"hidden": policy.hidden, "value_hidden": policy.value_hidden}
 
 

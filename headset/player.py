@@ -155,8 +155,9 @@ class Player:
         counts = f"{ends['fall']} falls, {ends['away']} times lost the user, {ends['bad']} diverged"
         every = f"one every {seconds / n:.1f} s" if n else "none"
         torque, state = (1000 * np.percentile(k, [50, 99]) for k in np.array(self.latency).T)
-        hands = f"hand error {100 * self.hand_error.sum() / ticks:.1f} cm, "
-        hands = hands if controllers and self.devices == 3 else ""
+        hands = ""
+        if controllers and self.devices == 3:
+            hands = f"hand error {100 * self.hand_error.sum() / ticks:.1f} cm, "
         return [
             f"{seconds:.1f} s played: {counts} ({every})",
             f"head error {100 * self.head_error.sum() / ticks:.1f} cm, {hands}mean over all ticks",

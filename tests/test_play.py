@@ -2,6 +2,7 @@
 
 import functools
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -400,6 +401,18 @@ def test_headset_only(char, ref, tmp_path):
     assert rows["tracked"] == pytest.approx(row, nan_ok=True) and list(rows) == ["tracked", "kinematic", "zero", "pd"]
 
 
+def test_a_long_sheet_has_sixty_pictures(tmp_path, monkeypatch, capsys):
+    """Half a second apart while they are few, evenly spread where they would be many; --every says otherwise."""
+    drawn = []
+    monkeypatch.setattr(play, "pictures", lambda char, ref, recording, frames, *_, **__: drawn.append(list(frames)))
+    monkeypatch.setattr(render, "contact_sheet", lambda images, labels, columns: None)
+    monkeypatch.setattr(render, "write_png", lambda path, image: None)
+    for last, every in ((90, None), (3600, None), (3600, 1.0)):
+        play._write_pictures(None, None, None, last, play.Options(png=str(tmp_path / "a.png"), every=every))
+    assert drawn[0] == list(range(0, 91, 15)) and drawn[1] == list(range(0, 3601, 60)) and len(drawn[2]) == 121
+    assert capsys.readouterr().out.count("a.png") == 3
+
+
 # ------------------------------------------------------------------------------------ comparing
 
 
@@ -437,6 +450,9 @@ def test_compare(two, tmp_path, capsys):
         alone = json.loads(out.read_text())
         assert alone["tracked"] == rows[f"{path} tracked"] and alone["streamed"] == rows[f"{path} streamed"]
     assert alone["kinematic"] == rows["kinematic oppy scale 0.8"]
+    [arm] = metrics.arms_of(data.sequences()[:1], play.Options(compare=(str(two[1]),)))
+    title = replace(arm, meta=arm.meta | {"carried": "old.npz"}).title()
+    assert title.endswith("1.5k steps, carried over from old.npz, not trained since")
     play.main([f"--compare={two[0]},{two[1]}", "--sensors", "hmd", "--json", str(out), *more])
     hanging = json.loads(out.read_text())
     for path, same in ((two[0], True), (two[1], False)):

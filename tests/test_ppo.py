@@ -570,7 +570,7 @@ def test_init_brings_its_widths(whole, tmp_path):
 def test_init_points_to_carry(whole, tmp_path):
     """Another character, fewer sensors or a critic that sees less: one line with the command that makes it fit."""
     for more, says in (
-        (("--character", "dino"), "it is jesse's"),
+        (("--character", "dino"), "does not fit dino: it is jesse's; this makes one that does"),
         (("--sensors", "hmd"), "obs_size 189, not 153; critic_size 459, not 423"),
         (("--without", "asymmetric"), "critic_size 459, not 189"),
     ):

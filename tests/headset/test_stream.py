@@ -750,6 +750,7 @@ def test_falls_are_counted(jesse):
         player.step(*still)
     assert player.ends[0]["fall"] >= 1 and np.isfinite(player.qpos).all()
     assert "falls" in player.report()[0] and "head error" in player.report()[1] and "p99" in player.report()[2]
+    assert ["hand error" in player.report(told)[1] for told in (True, False)] == [True, False]  # False: they hang
     player.stand(*still)
     before = player.ends[0]["away"]
     assert player.step(still[0] + [3.0, 0, 0], still[1]) == ["away"] and player.ends[0]["away"] == before + 1
