@@ -516,7 +516,7 @@ def streamed(char: Character, act, clips, devices=3, threads=0, sensors=None) ->
     The errors are of all frames; after a failure the character stands up under the headset and goes on.
     Args      act : observations (n, o) -> actions (n, u); clips : captures, each as long as it is or CAPTURE;
               sensors : as `shown_to`: with "hmd" the controllers of a policy of three devices hang
-    Returns   as `measure`, failures, fails_every_s, first_failure_s (median), within_1m (its own headset's, too)
+    Returns   as `measure`, seconds, failures, fails_every_s, first_failure_s (median), within_1m (its own headset's)
     Test      tests/test_metrics.py::test_streamed
     """
     hang = sensors == "hmd" and devices == 3
@@ -538,6 +538,7 @@ def streamed(char: Character, act, clips, devices=3, threads=0, sensors=None) ->
     whole = {k: row[k] * len(pieces) / len(clips) for k in ("success_phc", "success_height")}  # of captures, not lives
     return row | whole | {
         "clips": len(clips),
+        "seconds": ticks.sum() / ref.rate,
         "completed": float(np.mean(~failed)),
         "within_1m": float(np.mean([r.failures == 0 and r.farthest <= AWAY for r in rides])),
         "survival": float(np.mean(np.array(first) / ticks)),
@@ -605,33 +606,37 @@ class Options(MotionFlags, Switches):
     threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
 
 
-def motion_of(opt: Options) -> tuple[list, list]:
-    """The captures for the streamed row, and the stitched sequences for all others.
+def captures_of(opt: Options) -> list:
+    """The captures for the streamed row.
 
-    ASSUMED   at most MOST captures, evenly chosen; a half is every other one by name, of those that --clips leaves:
-              with other --clips a capture can be in the other half
-    Raises    UserError: no such row; a half without captures
+    ASSUMED   at most MOST, evenly; a half is every other by name of what --clips leaves: other --clips, other halves
+    Raises    UserError: a half without captures
     Test      tests/test_metrics.py::test_halves"""
-    if wrong := set(opt.rows) - set(ROWS):
-        raise UserError(f"--rows {','.join(sorted(wrong))}: unknown; valid: {', '.join(ROWS)}")
     split, reading = "all" if opt.all else opt.split, Reading.of(opt)
     single = mocap.data.load(opt.motion, clips=opt.clips, split=split, reading=reading)
     half = sorted(single, key=lambda c: c.name)[HALVES[opt.half]]
     if single and not half and "streamed" in opt.rows:
         raise UserError(f"--half {opt.half}: none of the {len(single)} captures; valid: both, select")
-    many = len(half)
-    single = [half[i] for i in np.unique(np.linspace(0, many - 1, min(many, MOST)).round().astype(int))]
-    long = mocap.data.sequences(opt.motion, split, opt.clips, seed=opt.seed, reading=reading)
-    if opt.user_scale != 1.0:
-        single, long = ([resize(c, opt.user_scale) for c in clips] for clips in (single, long))
-    return single, long
+    evenly = np.unique(np.linspace(0, len(half) - 1, min(len(half), MOST)).round().astype(int))
+    return [resize(half[i], opt.user_scale) if opt.user_scale != 1.0 else half[i] for i in evenly]
+
+
+def motion_of(opt: Options) -> tuple[list, list]:
+    """`captures_of` for the streamed row, and the stitched sequences for all others.
+
+    Raises    UserError: no such row
+    Test      tests/test_metrics.py::test_halves"""
+    if wrong := set(opt.rows) - set(ROWS):
+        raise UserError(f"--rows {','.join(sorted(wrong))}: unknown; valid: {', '.join(ROWS)}")
+    single, split = captures_of(opt), "all" if opt.all else opt.split
+    long = mocap.data.sequences(opt.motion, split, opt.clips, seed=opt.seed, reading=Reading.of(opt))
+    return single, [resize(c, opt.user_scale) for c in long] if opt.user_scale != 1.0 else long
 
 
 def measure_all(char, ref, policy, opt: Options, seen: Reference | None = None, captures=(), devices=3) -> dict:
     """The rows that opt asks for.
 
-    Args      captures : of the streamed row, left out without any; seen : what the policy is shown in the tracked row,
-              if not ref
+    Args      captures : of the streamed row, left out without any; seen : what it is shown when tracked, if not ref
     Test      tests/test_play.py::test_measure_json"""
     rows = {}
     if captures and "streamed" in opt.rows:
@@ -683,6 +688,7 @@ def run(opt: Options) -> None:
 
 
 # ------------------------------------------------------------------------------------ comparing
+
 
 @dataclass
 class Arm:

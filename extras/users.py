@@ -111,9 +111,15 @@ def users(opt: Options) -> dict:
 def row_of(char: Character, act, clips, devices, threads) -> dict:
     """What a character does under users, each a capture: numbers as `metrics.streamed`'s, and why it failed.
 
+    Test      tests/extras/test_users.py::test_row"""
+    return row_of_streams(char, act, [stream_of(char, clip, devices)[:2] for clip in clips], devices, threads)
+
+
+def row_of_streams(char: Character, act, streams, devices, threads) -> dict:
+    """The same under streams of poses, as `headset.player.ride` takes them.
+
     Errors    of headset and controllers over all frames [cm]; own slide without the jumps to where it is stood up
     Test      tests/extras/test_users.py::test_row"""
-    streams = [stream_of(char, clip, devices)[:2] for clip in clips]
     rides = ride(char, act, streams, devices, threads)
     ticks, failures = np.array([len(r.qpos) for r in rides]), np.array([r.failures for r in rides])
     first = np.array([r.lives[0][1] if r.failures else len(r.qpos) for r in rides])

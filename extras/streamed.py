@@ -1,0 +1,185 @@
+r"""The headline by one command: every set of captures, streamed, a row each; all together; no torque  [Reda23 §4].
+
+    python -m extras.streamed --character dino --mocap FOLDER --recordings sensors/validation --json OUT
+    python -m extras.streamed --character dino --mocap FOLDER --policy A.npz B.npz --half select      candidates
+
+    SETS ──► captures ──► metrics.streamed ──► a row a set ──► together ──► README.md's and RESULTS.md's tables
+    recordings, a user who does not move ──► users.row_of_streams ──► a row a source
+
+`--mocap` holds the folders bandai, cmu, bandai-standing, cmu-inplace and cmu-dance-karate; a set whose folder is not
+there is left out, and says so.  Choose on one half (`--half select`), report the other.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as ppo.py does, and says why; before NumPy is loaded
+
+import numpy as np
+
+import metrics
+import mocap.data
+import play
+from character import Character
+from extras.users import row_of_streams
+from headset.calibration import Stream
+from headset.player import Player
+from headset.reader import Sample
+from human import sensors
+from mocap.data import CONTROL_RATE
+from plumbing.cli import THREADS, arg, cell, cli, markdown, run_main
+from plumbing.files import atomic_write, check_folders
+from policy import check_fits, devices_of, find_policy, load_character
+
+HALVES = [half for half in metrics.HALVES if half != "both"]
+
+
+@dataclass
+class Set:
+    """A row of the table.  folder : below --mocap, or a built-in motion; split : "all" for a folder that is held out;
+    whole : both halves are shown, as there are too few to halve"""
+
+    title: str
+    folder: str
+    split: str = "validation"
+    clips: str = "*"
+    whole: bool = False
+
+
+SETS = (
+    Set("walks, unseen clips", "bandai", clips="*walk_*"),
+    Set("turns, unseen clips", "bandai", clips="*walk-turn*"),
+    Set("runs, unseen clips", "bandai", clips="*_run_*"),
+    Set("youthful: unseen style", "bandai", "style"),
+    Set("CMU: unseen bodies", "cmu", "body"),
+    Set("youthful, standing, arms", "bandai-standing/validation", "all"),
+    Set("CMU 14: exercises in place, boxing", "cmu-inplace/validation", "all", whole=True),
+    Set("CMU 61: salsa", "cmu-dance-karate/validation", "all"),
+    Set("built-in: start, stop, turn, sidestep, …", "builtin"),
+    Set("built-in: stand, strike, crouch, step", "standing"),
+)
+MINUTE = 62.0  # s of the user who does not move, of which the first second calibrates
+COLUMNS = (
+    ("clips", "captures", "{:d}"),
+    *(c for c in metrics.COLUMNS if c[0] in (
+        "completed", "within_1m", "survival", "fails_every_s", "first_failure_s", "root_cm", "head_cm", "hands_cm",
+        "foot_slide_cm_s", "own_slide_cm_s", "contact_agreement", "self_penetration_mm", "spring_share",
+    )),
+)  # fmt: skip
+
+
+@dataclass
+class Options:
+    """Which policies, on what."""
+
+    character: str | None = arg(None, "name in characters/, or path of a .toml; the policy's own by default, or jesse")
+    policy: tuple[str, ...] = arg((), "run folders or policy .npz, a table each; the character's own by default")
+    mocap: str | None = arg(None, "folder of the motion captures; the environment's MOCAP_DIR by default")
+    recordings: str | None = arg(None, "folder of headsets' recordings, too: a row for each source")
+    half: str = arg("report", "which captures: select, on which policies are chosen; report, the rest", tuple(HALVES))
+    json: str | None = arg(None, "write the tables here")
+    threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
+
+
+def captures_of(one: Set, folder: Path, half: str) -> list:
+    """A set's captures of that half; [] if its folder is not there.
+
+    Test      tests/extras/test_streamed.py::test_captures"""
+    motion = one.folder if one.folder in mocap.data.BUILTIN else str(folder / one.folder)
+    if motion != one.folder and not os.path.isdir(motion):
+        return []
+    half = "both" if one.whole and half == "report" else half
+    how = dict(split="validation", all=True) if one.split == "all" else dict(split=one.split)
+    return metrics.captures_of(metrics.Options(motion=motion, clips=one.clips, half=half, **how))
+
+
+def together(rows) -> dict:
+    """All captures of several rows as one: shares by captures, failures by time.  Errors stay by set: walks and dance
+    have no error in common.
+
+    Test      tests/extras/test_streamed.py::test_together"""
+    clips = np.array([r["clips"] for r in rows])
+    seconds, failures = sum(r["seconds"] for r in rows), sum(r["failures"] for r in rows)
+    shares = ("completed", "within_1m", "survival")
+    return {
+        "clips": int(clips.sum()),
+        **{k: float(clips @ [r[k] for r in rows] / clips.sum()) for k in shares},
+        "seconds": seconds,
+        "failures": failures,
+        "fails_every_s": seconds / failures if failures else float("inf"),
+    }
+
+
+def motionless(char: Character, devices: int):
+    """The stream of a user who stands in the first pose of a built-in walk and does not move.
+
+    Test      tests/extras/test_streamed.py::test_motionless"""
+    pos, quat = sensors(mocap.data.builtin_clips(CONTROL_RATE, name="standing")[0][:1])
+    stream = Stream(char, "mujoco", rate=CONTROL_RATE, devices=devices)
+    times, quat = np.arange(round(MINUTE * CONTROL_RATE)) / CONTROL_RATE, np.roll(quat, -1, axis=-1)
+    ticks = [tick for t in times for tick in stream.push(Sample(t, pos[0], quat[0]))]
+    return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks])
+
+
+def recorded(char: Character, folder, devices: int, opt: Options) -> dict:
+    """Source -> streams: the recordings of a folder by the first word of their names.
+
+    Test      tests/extras/test_streamed.py::test_recordings"""
+    by_source, flags = {}, play.Options(character=opt.character, stream=str(folder))
+    for file in play.recordings_of(folder):
+        source = file.stem.partition("_")[0]
+        by_source.setdefault(source, []).append(play.ticks_of(char, file, devices, flags))
+    return {f"recordings: {source}": streams for source, streams in by_source.items()}
+
+
+def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, devices: int):
+    """(title, numbers) of every row, one after the other: the sets, all of them together, no torque, the streams.
+
+    Test      tests/extras/test_streamed.py::test_command"""
+    still = lambda obs: np.zeros((len(obs), len(char.limits)))  # noqa: E731
+    for title, drive in (("all", act), ("all, no torque", still)):
+        rows = []
+        for name, clips in captures.items():
+            rows.append(metrics.streamed(char, drive, clips, devices, opt.threads))
+            if drive is act:
+                yield name, rows[-1]
+        if rows:
+            yield title, together(rows)
+    for name, several in streams.items():
+        row = row_of_streams(char, act, several, devices, opt.threads)
+        yield name, row | {"clips": row["captures"]}
+
+
+def main(argv=None):
+    """Print the tables.  Test: tests/extras/test_streamed.py::test_command"""
+    opt = cli(Options, metrics.listed(argv, "--policy"), "extras.streamed", __doc__)
+    folder = Path(opt.mocap or os.environ.get("MOCAP_DIR", "mocap"))
+    policies = [find_policy(metrics.Options(character=opt.character, policy=p)) for p in opt.policy or (None,)]
+    check_folders(opt.json, read=(folder, opt.recordings, *(path for _, path, _ in policies)))
+    captures = {one.title: captures_of(one, folder, opt.half) for one in SETS}
+    if gone := [title for title, clips in captures.items() if not clips]:
+        print(f"--mocap {folder}: without {'; '.join(gone)}", flush=True)
+    captures, out = {title: clips for title, clips in captures.items() if clips}, {}
+    for policy, path, meta in policies:
+        char = load_character(metrics.Options(character=opt.character), meta, path)
+        devices = devices_of(meta, path, None)
+        check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
+        streams = {"motionless, a minute": [motionless(char, devices)]}
+        streams |= recorded(char, opt.recordings, devices, opt) if opt.recordings else {}
+        print(f"\n{path}, {metrics.name_of(char)}, {opt.half} half\n")
+        print(markdown([["", *(heading for _, heading, _ in COLUMNS)]]), flush=True)
+        rows = out[str(path)] = {}
+        for title, row in rows_of(char, policy.mean_action, captures, streams, opt, devices):
+            rows[title] = row
+            cells = (cell(row.get(key, np.nan), form) for key, _, form in COLUMNS)
+            print("| " + " | ".join([title, *cells]) + " |", flush=True)
+    if opt.json:
+        rows = {f"{path}: {title}": row for path, rows in out.items() for title, row in rows.items()}
+        atomic_write(opt.json, metrics.as_json(rows))
+
+
+if __name__ == "__main__":
+    run_main(main)

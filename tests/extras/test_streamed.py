@@ -1,0 +1,88 @@
+"""extras/streamed.py: the sets and their halves, all of them together, and the table by its command."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import character
+import metrics
+from extras import streamed
+from mocap import data
+
+CHARACTER = Path(character.CHARACTERS) / "dino.npz"
+
+
+def test_captures(tmp_path):
+    """The halves share no capture and are all together; few captures are reported whole; no folder, none."""
+    one = streamed.Set("walks", "builtin")
+    names = [{c.name for c in streamed.captures_of(one, tmp_path, half)} for half in streamed.HALVES]
+    assert streamed.HALVES == ["select", "report"] and not names[0] & names[1]
+    assert names[0] | names[1] == {c.name for c in data.load("builtin", split="validation")}
+    few = streamed.Set("walks", "builtin", whole=True)
+    assert {c.name for c in streamed.captures_of(few, tmp_path, "report")} == names[0] | names[1]
+    assert {c.name for c in streamed.captures_of(few, tmp_path, "select")} == names[0]  # chosen on no more than others
+    assert streamed.captures_of(streamed.Set("gone", "bandai"), tmp_path, "report") == []
+
+
+def test_together():
+    """Two sets as one against the captures one by one."""
+    a = dict(clips=3, completed=2 / 3, within_1m=1 / 3, survival=0.8, seconds=10.0, failures=2, root_cm=5.0)
+    b = dict(clips=1, completed=0.0, within_1m=0.0, survival=0.4, seconds=5.0, failures=1, root_cm=9.0)
+    both = streamed.together([a, b])
+    assert both["clips"] == 4 and both["completed"] == pytest.approx(np.mean([1, 1, 0, 0]))
+    assert both["within_1m"] == pytest.approx(np.mean([1, 0, 0, 0])) and both["survival"] == pytest.approx(0.7)
+    assert both["fails_every_s"] == pytest.approx(5.0) and "root_cm" not in both
+    assert streamed.together([a | {"failures": 0}])["fails_every_s"] == float("inf")
+
+
+def test_motionless():
+    """A minute is played, in which no device moves."""
+    pos, quat = streamed.motionless(character.load("dino"), 3)
+    assert 60.0 <= len(pos) / data.CONTROL_RATE <= streamed.MINUTE - 0.9
+    assert np.ptp(pos, axis=0).max() < 1e-6 and np.ptp(quat, axis=0).max() < 1e-6
+
+
+def headset_file(path, seconds, speed):
+    """A headset's and two controllers' recording, of somebody who stands and then goes straight on."""
+    t = np.arange(0.0, seconds, 1 / 45)
+    x = np.maximum(t - 1.5, 0.0) * speed
+    rows = [[s, *(v for side in ((0, 1.7), (-0.3, 1), (0.3, 1)) for v in (*side, d, 0, 0, 0, 1))] for s, d in zip(t, x)]
+    names = [f"{n}_{k}" for n in ("head", "left", "right") for k in ("px", "py", "pz", "qx", "qy", "qz", "qw")]
+    head = ",".join(["time", *names])
+    path.write_text(head + "\n" + "\n".join(",".join(f"{v:.5f}" for v in row) for row in rows) + "\n")
+
+
+def test_recordings(tmp_path):
+    """A row a source: the first word of the files' names."""
+    for name in ("game_1.csv", "game_2.csv", "walk_1.csv"):
+        headset_file(tmp_path / name, 3.0, 0.3)
+    found = streamed.recorded(character.load("dino"), tmp_path, 3, streamed.Options())
+    assert {k: len(v) for k, v in found.items()} == {"recordings: game": 2, "recordings: walk": 1}
+    pos, quat = found["recordings: walk"][0]
+    assert pos.shape[1:] == (3, 3) and quat.shape[1:] == (3, 4) and len(pos) == len(quat)
+
+
+def test_command(tmp_path, monkeypatch, capsys):
+    """The rows of two policies: as `metrics.streamed` has them, and in the file; no torque completes nothing."""
+    one = streamed.Set("walks", "builtin", clips="walk_*")
+    monkeypatch.setattr(streamed, "SETS", (one, streamed.Set("gone", "bandai")))
+    monkeypatch.setattr(streamed, "MINUTE", 3.0)
+    monkeypatch.setattr(metrics, "MOST", 2)
+    other, out = tmp_path / "other.npz", tmp_path / "table.json"
+    shutil.copy(CHARACTER, other)
+    words = ["--character", "dino", "--policy", CHARACTER, other, "--mocap", tmp_path, "--half", "select"]
+    streamed.main([*map(str, words), "--json", str(out)])
+    printed, rows = capsys.readouterr().out, json.loads(out.read_text())
+    assert f"--mocap {tmp_path}: without gone" in printed and printed.count("| all, no torque |") == 2
+    mine, again = ([v for k, v in rows.items() if k.startswith(f"{p}: ")] for p in (CHARACTER, other))
+    assert len(mine) == 4 and mine == again
+    walks, every, limp, still = mine
+    policy, path, meta = metrics.find_policy(metrics.Options(character="dino"))
+    char = character.load("dino")
+    direct = metrics.streamed(char, policy.mean_action, streamed.captures_of(one, tmp_path, "select"))
+    assert walks == pytest.approx(json.loads(metrics.as_json({"": direct}))[""])
+    assert every["completed"] == walks["completed"] > limp["completed"] == 0.0
+    assert still["clips"] == 1 and still["completed"] == 1.0
