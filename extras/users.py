@@ -4,9 +4,11 @@ r"""Other users through the whole pipeline, and how a character fails under them
     python -m extras.users --motion FOLDER --by none           as they are: dance, sport, arms
     python -m extras.users --motion FOLDER --by pace           slower and faster: §6's fast motion
     python -m extras.users --motion FOLDER --by crossing       legs under another's trunk: §6's uncorrelated motion
+    python -m extras.users --motion FOLDER --by tilt           a headset that sits, or a head that is held, otherwise
+    python -m extras.users --motion FOLDER --by push           the character is pushed: §6's unbalancing
 
-    clips ──► of_build, warp, crossed ──► recorded headset, calibrated ──► ride ──► completed, falls, losses, errors
-              joints                      by its first second              streamed, from the default pose
+    clips ──► of_build, warp, tilted, … ──► recorded headset, calibrated ──► ride ──► completed, falls, losses, errors
+              joints                        by its first second              streamed, from the default pose
 
 Nothing is told of a user's build: stature, trunk and arms change the human, from it the devices are taken, and from
 their first second the calibration.  Falls and losses are counted apart: to topple is not to be left behind.
@@ -17,6 +19,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from dataclasses import dataclass, fields, replace
+from itertools import product
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as ppo.py does, and says why; before NumPy is loaded
 
@@ -42,6 +45,9 @@ BUILDS = {  # ASSUMED: trunk and arms in proportion to the legs, as times the re
 }
 MIDDLE = 1.75  # m: at other heights the arms are as recorded
 PACES = (0.75, 1.0, 1.25, 1.5, 2.0)  # times as fast as recorded
+PUSHES = (0.25, 0.5, 1.0)  # m/s: what they change of the whole body's velocity, so that the light and the heavy compare
+PUSHED_AT = 3.5  # s of play: a capture's user has set off by then
+TILTS = (-20.0, -10.0, 0.0, 10.0, 20.0)  # degrees, chin down positive
 UPPER = [i for name, i in SEG.items() if not name.startswith(("pelvis", "thigh", "shin", "foot"))]
 STATURES = (lambda v: v and all(0.5 <= x <= 2.5 for x in v), "one or more statures from 0.5 to 2.5 metres, as 1.6,1.9")
 
@@ -54,7 +60,7 @@ class Options(metrics.MotionFlags):
         ("jesse", "oppy", "dino"), "names or .toml paths, the .npz beside it", check=(len, "one or more names")
     )
     heights: tuple[float, ...] = arg((1.45, 1.6, MIDDLE, 1.9, 2.0), "statures of the users [m]", check=STATURES)
-    by: str = arg("height", "what the users differ by", choices=("height", "pace", "crossing", "none"))
+    by: str = arg("height", "what the users differ by", choices=("height", "pace", "crossing", "tilt", "push", "none"))
     split: str = arg("validation", "which part", choices=("train", "validation", "style", "body"))
     half: str = arg("report", "which captures, as metrics.py: select, report, both", choices=tuple(metrics.HALVES))
     json: str | None = arg(None, "write the table here")
@@ -89,15 +95,28 @@ def crossed(clip, other):
     return replace(clip, name=f"{clip.name}-under-{other.name}", pos=pos, quat=quat)
 
 
+def tilted(clip, degrees):
+    r"""The same motion with the head, and the headset on it, pitched all the time.
+
+    Equation  R' = R_head R_y(degrees), about the head's joint: the eyes move with it, by 2 cm at 10°
+    Why       nobody wears a headset as another does, or holds the head so, and nothing in it tells which
+    Test      tests/extras/test_users.py::test_tilted"""
+    half, quat, head = np.deg2rad(degrees) / 2, clip.quat.copy(), SEG["head"]
+    quat[:, head] = quat_mul(quat[:, head], np.array([np.cos(half), 0.0, np.sin(half), 0.0]))
+    return replace(clip, quat=quat)
+
+
 def users(opt: Options) -> dict:
     """Row name -> function of the captures: who plays them.  Test: tests/extras/test_users.py::test_rows"""
     recorded = {"as recorded": list}
-    if opt.by == "none":
+    if opt.by in ("none", "push"):
         return recorded
     if opt.by == "crossing":  # ASSUMED: the other is half the captures on, of another kind where they are in order
         return recorded | {"crossed": lambda clips: list(map(crossed, clips, clips[len(clips) // 2 :] + clips))}
     if opt.by == "pace":
         return {f"{pace:g} of the pace": lambda clips, s=pace: [warp(c, s) for c in clips] for pace in PACES}
+    if opt.by == "tilt":
+        return {f"head {tilt:+g}°": lambda clips, a=tilt: [tilted(c, a) for c in clips] for tilt in TILTS}
     rows = {}
     for height in opt.heights:
         for name, (trunk, arms) in BUILDS.items():
@@ -108,19 +127,35 @@ def users(opt: Options) -> dict:
     return rows
 
 
-def row_of(char: Character, act, clips, devices, threads) -> dict:
+def pushes(char: Character, opt: Options) -> dict:
+    r"""What is added to a row's name -> the push, None for none.
+
+    Equation  F = m Δv / PUSH_SECONDS, m the character's mass
+    Test      tests/extras/test_users.py::test_pushes"""
+    mass, none = char.model.body_subtreemass[char.root], {"": None}
+    if opt.by != "push":
+        return none
+    return none | {
+        f", {name} by {size:g} m/s": metrics.Push(mass * size / metrics.PUSH_SECONDS, PUSHED_AT, angle)
+        for size in PUSHES
+        for name, angle in metrics.DIRECTIONS.items()
+    }
+
+
+def row_of(char: Character, act, clips, devices, threads, push=None) -> dict:
     """What a character does under users, each a capture: numbers as `metrics.streamed`'s, and why it failed.
 
     Test      tests/extras/test_users.py::test_row"""
-    return row_of_streams(char, act, [stream_of(char, clip, devices)[:2] for clip in clips], devices, threads)
+    return row_of_streams(char, act, [stream_of(char, clip, devices)[:2] for clip in clips], devices, threads, push)
 
 
-def row_of_streams(char: Character, act, streams, devices, threads) -> dict:
+def row_of_streams(char: Character, act, streams, devices, threads, push=None) -> dict:
     """The same under streams of poses, as `headset.player.ride` takes them.
 
+    Args      push : `metrics.Push`, of all of them, counted from the start of play
     Errors    of headset and controllers over all frames [cm]; own slide without the jumps to where it is stood up
     Test      tests/extras/test_users.py::test_row"""
-    rides = ride(char, act, streams, devices, threads)
+    rides = ride(char, act, streams, devices, threads, push.force if push else None)
     ticks, failures = np.array([len(r.qpos) for r in rides]), np.array([r.failures for r in rides])
     first = np.array([r.lives[0][1] if r.failures else len(r.qpos) for r in rides])
     ends, slides = sum((r.ends for r in rides), Counter()), np.concatenate([slides_of(char, r) for r in rides])
@@ -171,9 +206,9 @@ def main(argv=None):
         own = metrics.Options(character=name)
         char, devices = load_character(own, meta, path), devices_of(meta, path, None)
         check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
-        for title, played_by in users(opt).items():
-            row = row_of(char, policy.mean_action, played_by(captures), devices, opt.threads)
-            out[title := f"{metrics.name_of(char)}: {title}"] = row
+        for (user, played_by), (pushed, push) in product(users(opt).items(), pushes(char, opt).items()):
+            row = row_of(char, policy.mean_action, played_by(captures), devices, opt.threads, push)
+            out[title := f"{metrics.name_of(char)}: {user}{pushed}"] = row
             print("| " + " | ".join([title, *(cell(row[k], f) for k, f in COLUMNS.items())]) + " |", flush=True)
     if opt.json:
         atomic_write(opt.json, metrics.as_json(out))

@@ -195,25 +195,25 @@ class Ride:
         return list(zip(cuts[:-1], cuts[1:]))
 
 
-def ride(char: Character, act, streams, devices=3, threads=0) -> list[Ride]:
+def ride(char: Character, act, streams, devices=3, threads=0, force=None) -> list[Ride]:
     """Drive one character a stream, side by side with those whose streams are about as long.
 
-    Args      act : as `Player`; streams : (pos (T, 3, 3), quat (T, 3, 4)) of each, in the character's world
+    Args      act, force : as `Player`; streams : (pos (T, 3, 3), quat (T, 3, 4)) of each, in the character's world
     Test      tests/headset/test_stream.py::test_side_by_side
     """
     lengths, out = np.array([len(pos) for pos, _ in streams]), {}
     ids = sorted(range(len(streams)), key=lengths.__getitem__)
     while ids:  # who has ended is simulated until all have: so none is much longer than the others
         group = [i for i in ids if lengths[i] <= 1.5 * lengths[ids[0]]]
-        out |= zip(group, _ride(char, act, [streams[i] for i in group], devices, threads), strict=True)
+        out |= zip(group, _ride(char, act, [streams[i] for i in group], devices, threads, force), strict=True)
         ids = ids[len(group) :]
     return [out[i] for i in range(len(streams))]
 
 
-def _ride(char, act, streams, devices, threads) -> list[Ride]:
+def _ride(char, act, streams, devices, threads, force) -> list[Ride]:
     """The same of one group."""
     n, lengths = len(streams), np.array([len(pos) for pos, _ in streams])
-    player = Player(char, act, n, devices=devices, threads=threads)
+    player = Player(char, act, n, force=force, devices=devices, threads=threads)
     pos, quat = (
         np.stack([np.concatenate([s[k], np.repeat(s[k][-1:], lengths.max() - len(s[k]), axis=0)]) for s in streams], 1)
         for k in (0, 1)

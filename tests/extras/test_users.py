@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 import character
 import metrics
 from extras import users
-from human import SEG, headset_height
+from headset.player import ride, stream_of
+from human import SEG, headset_height, sensors
 from mocap import data
 from plumbing.cli import run_main
 
@@ -52,9 +53,56 @@ def test_rows(clip):
     paces = users.users(users.Options(by="pace"))
     lengths = [len(f([clip])[0]) for f in paces.values()]
     assert list(paces)[-1] == "2 of the pace" and lengths == [79, 60, 48, 40, 30]  # 59 intervals ÷ s
+    tilts = users.users(users.Options(by="tilt"))
+    assert list(tilts) == ["head -20°", "head -10°", "head +0°", "head +10°", "head +20°"]
+    np.testing.assert_array_equal(tilts["head -20°"]([clip])[0].quat, users.tilted(clip, -20.0).quat)
     same, cross = users.users(users.Options(by="crossing")).values()
     names = [c.name for c in cross([replace(clip, name=n) for n in "abcde"])]
     assert names == [f"{a}-under-{b}" for a, b in zip("abcde", "cdeab", strict=True)]
+
+
+def test_tilted(clip):
+    """SciPy's rotation of the head about its own left; all else stays; the headset goes where the head takes it."""
+    other = users.tilted(clip, 10.0)
+    turn = Rotation.from_quat(clip.quat[:, SEG["head"]], scalar_first=True).inv() * Rotation.from_quat(
+        other.quat[:, SEG["head"]], scalar_first=True
+    )
+    np.testing.assert_allclose(turn.as_rotvec(degrees=True), np.tile([0.0, 10.0, 0.0], (len(clip), 1)), atol=1e-6)
+    rest = [i for name, i in SEG.items() if name != "head"]
+    np.testing.assert_array_equal(other.quat[:, rest], clip.quat[:, rest])
+    (was, was_turned), (pos, turned) = sensors(clip), sensors(other)
+    assert 0.01 < np.linalg.norm(pos[:, 0] - was[:, 0], axis=1).mean() < 0.04
+    ahead = [Rotation.from_quat(q[:, 0], scalar_first=True).as_matrix()[:, 2, 0].mean() for q in (was_turned, turned)]
+    assert ahead[1] < ahead[0] - 0.1  # positive: chin down
+    np.testing.assert_array_equal(pos[:, 1:], was[:, 1:])
+
+
+def test_pushes():
+    """Four directions of each size; a free body as heavy goes as fast as the row says."""
+    char = character.load("oppy")
+    rows = users.pushes(char, users.Options(by="push"))
+    assert len(rows) == 1 + 4 * len(users.PUSHES) and rows[""] is None
+    push, dt, moved = rows[", left by 0.5 m/s"], 1e-3, 0.0
+    for k in range(6000):
+        moved = moved + push.force(k * dt, 0.0) / float(char.model.body_mass.sum()) * dt
+    np.testing.assert_allclose(moved, [0.0, 0.5, 0.0], atol=1e-3)
+    assert users.pushes(char, users.Options(by="tilt")) == {"": None}
+
+
+def test_pushed_while_played(clip):
+    """A push moves the character when it comes, and not before; a large one throws it over."""
+    char = character.load("oppy")
+    rows = users.pushes(char, users.Options(by="push"))
+    streams = [stream_of(char, data.load("standing")[0])[:2]]
+    limp = lambda obs: np.zeros((len(obs), len(char.limits)))  # noqa: E731
+    calm, pushed = (
+        ride(char, limp, streams, force=push and replace(push, at=0.5).force)
+        for push in (None, rows[", left by 1 m/s"])
+    )
+    at = round(0.5 * data.CONTROL_RATE)
+    np.testing.assert_array_equal(calm[0].qpos[: at + 1], pushed[0].qpos[: at + 1])
+    sideways = pushed[0].qpos[at : at + 8, 1] - calm[0].qpos[at : at + 8, 1]
+    assert sideways[0] == 0.0 and (np.diff(sideways) > 0).all() and sideways[-1] > 0.05
 
 
 def test_crossed(clip):
