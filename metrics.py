@@ -531,7 +531,7 @@ def streamed(char: Character, act, clips, devices=3, threads=0, sensors=None) ->
         for a, b in r.lives:
             parts = (v[a:b] for v in (r.qpos, r.contact, r.action))
             pieces.append(Recording(start + np.arange(a, b), *parts, r.failures > 0, b - a))
-        first.append(r.lives[0][1] if r.failures else len(r.qpos))
+        first.append(r.first)
     failed = np.array([r.failures > 0 for r in rides])
     failures, ticks = sum(r.failures for r in rides), np.array([len(r.qpos) for r in rides])
     row = measure(char, ref, pieces)

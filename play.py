@@ -502,7 +502,7 @@ def _write_pictures(char, ref, recording, last, opt):
 
 # ------------------------------------------------------------------------------------ many recordings
 
-OF_FILE = ("seconds", "completed", "failures", "fails_every_s", "head_cm", "hands_cm", "own_slide_cm_s")
+OF_FILE = ("seconds", "completed", "survival", "failures", "fails_every_s", "head_cm", "hands_cm", "own_slide_cm_s")
 
 
 def recordings_of(path) -> list[Path]:
@@ -572,6 +572,7 @@ def summary_of(rides, slides, devices: int) -> dict:
     return {
         "seconds": round(seconds, 3),
         "completed": float(np.mean([r.failures == 0 for r in rides])),
+        "survival": float(np.mean([r.first / len(r.qpos) for r in rides])),
         "failures": int(failures),
         "fails_every_s": seconds / failures if failures else None,
         "head_cm": 100 * sum(r.head for r in rides) / ticks,

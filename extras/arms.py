@@ -398,6 +398,7 @@ def main(argv=None):
         return
     what, names = (words[0], words[1:]) if words else ("", [])
     if what == "ship" and len(names) == 2 and not flags:
+        policies.check_new(names[1])
         check_folders(names[1], read=names[:1])
         meta = ship(*names)
         print(f"{names[1]}: {runs.fmt_count(meta['steps'])} steps; {meta['licence']}")

@@ -157,7 +157,7 @@ def row_of_streams(char: Character, act, streams, devices, threads, push=None) -
     Test      tests/extras/test_users.py::test_row"""
     rides = ride(char, act, streams, devices, threads, push.force if push else None)
     ticks, failures = np.array([len(r.qpos) for r in rides]), np.array([r.failures for r in rides])
-    first = np.array([r.lives[0][1] if r.failures else len(r.qpos) for r in rides])
+    first = np.array([r.first for r in rides])
     ends, slides = sum((r.ends for r in rides), Counter()), np.concatenate([slides_of(char, r) for r in rides])
     total = ticks.sum()
     return {

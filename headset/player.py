@@ -189,6 +189,11 @@ class Ride:
         return sum(self.ends.values())
 
     @property
+    def first(self):
+        """Ticks before the first failure; all of them without one."""
+        return self.lives[0][1] if self.failures else len(self.qpos)
+
+    @property
     def lives(self) -> list[tuple[int, int]]:
         """(first tick, the one after the last) from each stand to the next; between two of them a jump is no motion."""
         cuts = [*map(int, np.flatnonzero(self.anew)), len(self.qpos)]

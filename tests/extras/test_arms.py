@@ -149,6 +149,8 @@ def test_ship(two, tmp_path, capsys):
     np.testing.assert_array_equal(own.mean_action(seen), light.mean_action(seen))
     assert light.value_hidden == arms.STUB and meta["options"]["without"] == ["contact"]
     assert meta["options"]["out"] is None
+    with pytest.raises(UserError, match="exists already"):
+        arms.main(["ship", str(two / "dino-contact.0"), str(out)])
 
 
 @pytest.mark.parametrize(

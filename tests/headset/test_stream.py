@@ -831,6 +831,8 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
     assert total["seconds"] == pytest.approx(sum(r["seconds"] for r in found["files"].values()), abs=0.01)
     assert total["failures"] == sum(r["failures"] for r in found["files"].values())
     assert total["completed"] == np.mean([r["completed"] for r in found["files"].values()])
+    assert total["survival"] == pytest.approx(np.mean([r["survival"] for r in found["files"].values()]))
+    assert all((r["survival"] == 1.0) == r["completed"] and 0.0 < r["survival"] <= 1.0 for r in found["files"].values())
     (tmp_path / "broken.csv").write_text("time,head_px\n0,1\n")
     (tmp_path / "gone.csv").symlink_to(tmp_path / "nothing")
     (tmp_path / "sub" / "b.csv").rename(tmp_path / "b\x1b[31m\udcff.csv")
