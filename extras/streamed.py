@@ -27,10 +27,10 @@ from character import Character
 from extras.users import row_of_streams
 from headset.calibration import Stream
 from headset.player import Player
-from headset.reader import Sample
+from headset.reader import Sample, sound
 from human import sensors
 from mocap.data import CONTROL_RATE
-from plumbing.cli import THREADS, arg, cell, cli, markdown, run_main
+from plumbing.cli import THREADS, UserError, arg, cell, cli, markdown, run_main
 from plumbing.files import atomic_write, check_folders
 from policy import check_fits, devices_of, find_policy, load_character
 
@@ -124,15 +124,15 @@ def motionless(char: Character, devices: int):
     return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks])
 
 
-def recorded(char: Character, folder, devices: int, opt: Options) -> dict:
-    """Source -> streams: the recordings of a folder by the first word of their names.
+def recorded(char: Character, folder, devices: int) -> tuple[dict, list[str]]:
+    """Source -> streams: the recordings of a folder by the first word of their names; a line for each that is broken.
 
     Test      tests/extras/test_streamed.py::test_recordings"""
-    by_source, flags = {}, play.Options(character=opt.character, stream=str(folder))
-    for file in play.recordings_of(folder):
-        source = file.stem.partition("_")[0]
-        by_source.setdefault(source, []).append(play.ticks_of(char, file, devices, flags))
-    return {f"recordings: {source}": streams for source, streams in by_source.items()}
+    by_source, flags = {}, play.Options(stream=str(folder))
+    taken, broken = sound(lambda file: (file, play.ticks_of(char, file, devices, flags)), play.recordings_of(folder))
+    for file, stream in taken:
+        by_source.setdefault(f"recordings: {file.stem.partition('_')[0]}", []).append(stream)
+    return by_source, broken
 
 
 def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, devices: int):
@@ -153,32 +153,44 @@ def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, d
         yield name, row | {"clips": row["captures"]}
 
 
-def main(argv=None):
-    """Print the tables.  Test: tests/extras/test_streamed.py::test_command"""
+def main(argv=None) -> int:
+    """Print the tables.  -> exit status, 1 if a recording could not be read
+
+    Test      tests/extras/test_streamed.py::test_command, test_wrong_commands"""
     opt = cli(Options, metrics.listed(argv, "--policy"), "extras.streamed", __doc__)
-    folder = Path(opt.mocap or os.environ.get("MOCAP_DIR", "mocap"))
-    policies = [find_policy(metrics.Options(character=opt.character, policy=p)) for p in opt.policy or (None,)]
-    check_folders(opt.json, read=(folder, opt.recordings, *(path for _, path, _ in policies)))
-    captures = {one.title: captures_of(one, folder, opt.half) for one in SETS}
-    if gone := [title for title, clips in captures.items() if not clips]:
-        print(f"--mocap {folder}: without {'; '.join(gone)}", flush=True)
-    captures, out = {title: clips for title, clips in captures.items() if clips}, {}
-    for policy, path, meta in policies:
-        char = load_character(metrics.Options(character=opt.character), meta, path)
-        devices = devices_of(meta, path, None)
+    folder = opt.mocap or os.environ.get("MOCAP_DIR") or ""
+    if folder and not os.path.isdir(folder):
+        raise UserError(
+            f"--mocap {folder}: no such folder; valid: one with bandai, cmu, … in it (python -m mocap fetch)"
+        )
+    if opt.recordings and not os.path.exists(opt.recordings):
+        raise UserError(f"--recordings {opt.recordings}: no such folder; valid: one of .csv or .bsor files")
+    found = [find_policy(metrics.Options(character=opt.character, policy=p)) for p in opt.policy or (None,)]
+    check_folders(opt.json, read=(folder, opt.recordings, *(path for _, path, _ in found)))
+    own, cast = metrics.Options(character=opt.character), []
+    for policy, path, meta in found:
+        char, devices = load_character(own, meta, path), devices_of(meta, path, None)
         check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
+        cast.append((policy, path, char, devices))
+    captures = {one.title: captures_of(one, Path(folder), opt.half) for one in SETS}
+    if gone := [title for title, clips in captures.items() if not clips]:
+        print(f"{f'--mocap {folder} is' if folder else 'no --mocap:'} without {'; '.join(gone)}", flush=True)
+    captures, out, broken = {title: clips for title, clips in captures.items() if clips}, {}, []
+    for policy, path, char, devices in cast:
         streams = {"motionless, a minute": [motionless(char, devices)]}
-        streams |= recorded(char, opt.recordings, devices, opt) if opt.recordings else {}
+        if opt.recordings:
+            by_source, broken = recorded(char, opt.recordings, devices)
+            streams |= by_source
         print(f"\n{path}, {metrics.name_of(char)}, {opt.half} half\n")
         print(markdown([["", *(heading for _, heading, _ in COLUMNS)]]), flush=True)
-        rows = out[str(path)] = {}
         for title, row in rows_of(char, policy.mean_action, captures, streams, opt, devices):
-            rows[title] = row
+            out[f"{path}: {title}"] = row
             cells = (cell(row.get(key, np.nan), form) for key, _, form in COLUMNS)
             print("| " + " | ".join([title, *cells]) + " |", flush=True)
     if opt.json:
-        rows = {f"{path}: {title}": row for path, rows in out.items() for title, row in rows.items()}
-        atomic_write(opt.json, metrics.as_json(rows))
+        atomic_write(opt.json, metrics.as_json(out))
+    print(*broken, sep="\n", end="\n" if broken else "")
+    return int(bool(broken))
 
 
 if __name__ == "__main__":

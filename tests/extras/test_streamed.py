@@ -11,6 +11,7 @@ import character
 import metrics
 from extras import streamed
 from mocap import data
+from plumbing.cli import UserError
 
 CHARACTER = Path(character.CHARACTERS) / "dino.npz"
 
@@ -56,10 +57,12 @@ def headset_file(path, seconds, speed):
 
 
 def test_recordings(tmp_path):
-    """A row a source: the first word of the files' names."""
+    """A row a source: the first word of the files' names; a broken file costs itself alone, and is named."""
     for name in ("game_1.csv", "game_2.csv", "walk_1.csv"):
         headset_file(tmp_path / name, 3.0, 0.3)
-    found = streamed.recorded(character.load("dino"), tmp_path, 3, streamed.Options())
+    (tmp_path / "walk_2.csv").write_text("time,head_px\n0,1\n")
+    found, [broken] = streamed.recorded(character.load("dino"), tmp_path, 3)
+    assert "walk_2.csv" in broken
     assert {k: len(v) for k, v in found.items()} == {"recordings: game": 2, "recordings: walk": 1}
     pos, quat = found["recordings: walk"][0]
     assert pos.shape[1:] == (3, 3) and quat.shape[1:] == (3, 4) and len(pos) == len(quat)
@@ -76,7 +79,7 @@ def test_command(tmp_path, monkeypatch, capsys):
     words = ["--character", "dino", "--policy", CHARACTER, other, "--mocap", tmp_path, "--half", "select"]
     streamed.main([*map(str, words), "--json", str(out)])
     printed, rows = capsys.readouterr().out, json.loads(out.read_text())
-    assert f"--mocap {tmp_path}: without gone" in printed and printed.count("| all, no torque |") == 2
+    assert f"--mocap {tmp_path} is without gone" in printed and printed.count("| all, no torque |") == 2
     mine, again = ([v for k, v in rows.items() if k.startswith(f"{p}: ")] for p in (CHARACTER, other))
     assert len(mine) == 4 and mine == again
     walks, every, limp, still = mine
@@ -86,3 +89,20 @@ def test_command(tmp_path, monkeypatch, capsys):
     assert walks == pytest.approx(json.loads(metrics.as_json({"": direct}))[""])
     assert every["completed"] == walks["completed"] > limp["completed"] == 0.0
     assert still["clips"] == 1 and still["completed"] == 1.0
+
+
+@pytest.mark.parametrize(
+    "words, says",
+    [
+        (["--mocap", "/nope"], "--mocap /nope: no such folder"),
+        (["--recordings", "/nope"], "--recordings /nope: no such folder"),
+        (["--policy", "nope.npz"], "no policy nope.npz"),
+        (["--character", "oppy", "--policy", str(CHARACTER)], "oppy needs"),
+        (["--json", "/nope/x.json"], "there is no folder /nope"),
+    ],
+)
+def test_wrong_commands(words, says, monkeypatch):
+    """One line, before any motion is read."""
+    monkeypatch.setattr(streamed, "captures_of", lambda *_: pytest.fail("motion was read"))
+    with pytest.raises(UserError, match=says):
+        streamed.main(words)
