@@ -43,7 +43,7 @@ from headset.player import Pace, Player, drive, ride, stream_of
 from headset.reader import DEVICES, GAP, arriving, files_of, is_live, sound
 from human import heading, sensors
 from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_action, simulate
-from mocap.augment import resize
+from mocap.augment import looking, resize
 from mocap.data import CONTROL_RATE
 from mocap.rigs import Reading
 from plumbing.cli import NONNEGATIVE, PNG, POSITIVE, UserError, arg, cli, given_flags, printable, run_main
@@ -318,6 +318,7 @@ def _open_viewer(model, data, root, how, port):
 # ------------------------------------------------------------------------------------ figures of the paper
 
 USER = "walk_105"  # the built-in walk of the figures, unless --motion or --clips says another
+LOOKS = (6,)  # figures of whose own user the head turns, as that of the paper's
 
 
 def figure_options(opt: Options, argv) -> Options:
@@ -348,6 +349,7 @@ def play_figure(opt: Options) -> None:
     render.check_video(opt.video)
     _, long = metrics.motion_of(opt)
     clip = chosen(long, opt)
+    clip = looking(clip) if opt.figure in LOOKS and opt.clips == USER else clip
     arms, columns = metrics.arms_of([clip], opt), [c for c in metrics.COLUMNS if c[0] in OF_FIGURE]
     rows = {a.path: metrics.streamed(a.char, a.policy.mean_action, [clip], a.devices, opt.threads) for a in arms}
     print(*(a.title() for a in arms), "streamed", metrics.comparison(rows, columns), sep="\n")

@@ -114,7 +114,7 @@ def together(rows) -> dict:
 
 
 def motionless(char: Character, devices: int):
-    """The stream of a user who stands in the first pose of a built-in walk and does not move.
+    """The stream of a user who stands as the built-in `standing` motions begin, and does not move.
 
     Test      tests/extras/test_streamed.py::test_motionless"""
     pos, quat = sensors(mocap.data.builtin_clips(CONTROL_RATE, name="standing")[0][:1])

@@ -4,7 +4,7 @@ r"""Other users through the whole pipeline, and how a character fails under them
     python -m extras.users --motion FOLDER --by none           as they are: dance, sport, arms
     python -m extras.users --motion FOLDER --by pace           slower and faster: §6's fast motion
     python -m extras.users --motion FOLDER --by crossing       legs under another's trunk: §6's uncorrelated motion
-    python -m extras.users --motion FOLDER --by tilt           a headset that sits, or a head that is held, otherwise
+    python -m extras.users --motion FOLDER --by head           held otherwise, or a headset that sits so; looking around
     python -m extras.users --motion FOLDER --by push           the character is pushed: §6's unbalancing
 
     clips ──► of_build, warp, tilted, … ──► recorded headset, calibrated ──► ride ──► completed, falls, losses, errors
@@ -29,7 +29,7 @@ import metrics
 from character import Character
 from headset.player import Player, ride, stream_of
 from human import SEG, SENSOR_OFFSETS, headset_height, quat_conj, quat_mul, quat_rotate
-from mocap.augment import resize, warp
+from mocap.augment import looking, resize, warp
 from mocap.data import CONTROL_RATE, parts
 from play import slides_of
 from plumbing.cli import THREADS, UserError, arg, cell, cli, given_flags, markdown, run_main
@@ -48,6 +48,7 @@ PACES = (0.75, 1.0, 1.25, 1.5, 2.0)  # times as fast as recorded
 PUSHES = (0.25, 0.5, 1.0)  # m/s: what they change of the whole body's velocity, so that the light and the heavy compare
 PUSHED_AT = 3.5  # s of play: a capture's user has set off by then
 TILTS = (-20.0, -10.0, 0.0, 10.0, 20.0)  # degrees, chin down positive
+LOOKS = (20.0, 40.0)  # degrees to the left, then to the right, and again
 UPPER = [i for name, i in SEG.items() if not name.startswith(("pelvis", "thigh", "shin", "foot"))]
 STATURES = (lambda v: v and all(0.5 <= x <= 2.5 for x in v), "one or more statures from 0.5 to 2.5 metres, as 1.6,1.9")
 
@@ -60,7 +61,7 @@ class Options(metrics.MotionFlags):
         ("jesse", "oppy", "dino"), "names or .toml paths, the .npz beside it", check=(len, "one or more names")
     )
     heights: tuple[float, ...] = arg((1.45, 1.6, MIDDLE, 1.9, 2.0), "statures of the users [m]", check=STATURES)
-    by: str = arg("height", "what the users differ by", choices=("height", "pace", "crossing", "tilt", "push", "none"))
+    by: str = arg("height", "what the users differ by", choices=("height", "pace", "crossing", "head", "push", "none"))
     split: str = arg("validation", "which part", choices=("train", "validation", "style", "body"))
     half: str = arg("report", "which captures, as metrics.py: select, report, both", choices=tuple(metrics.HALVES))
     json: str | None = arg(None, "write the table here")
@@ -115,8 +116,9 @@ def users(opt: Options) -> dict:
         return recorded | {"crossed": lambda clips: list(map(crossed, clips, clips[len(clips) // 2 :] + clips))}
     if opt.by == "pace":
         return {f"{pace:g} of the pace": lambda clips, s=pace: [warp(c, s) for c in clips] for pace in PACES}
-    if opt.by == "tilt":
-        return {f"head {tilt:+g}°": lambda clips, a=tilt: [tilted(c, a) for c in clips] for tilt in TILTS}
+    if opt.by == "head":
+        looks = {f"looks {yaw:g}° aside": lambda clips, a=yaw: [looking(c, a) for c in clips] for yaw in LOOKS}
+        return {f"head {tilt:+g}°": lambda clips, a=tilt: [tilted(c, a) for c in clips] for tilt in TILTS} | looks
     rows = {}
     for height in opt.heights:
         for name, (trunk, arms) in BUILDS.items():

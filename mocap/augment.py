@@ -143,6 +143,18 @@ def restyle(clip: Clip, rng: np.random.Generator, swing=(0.1, 1.6), bearing=1.0)
     return replace(clip, name=f"{clip.name}-restyled", pos=pos, quat=quat_continuous(quat))
 
 
+def looking(clip: Clip, degrees=40.0, period=3.0) -> Clip:
+    r"""The same by a user who looks to the left and to the right, in turn.
+
+    Equation  R' = R_z(a sin(2π t / T)) R_head about the head's joint, a `degrees`, T `period` [s]
+    Test      tests/mocap/test_mocap.py::test_looking"""
+    t, quat, head = np.arange(len(clip)) / clip.rate, clip.quat.copy(), SEG["head"]
+    yaw = np.deg2rad(degrees) * np.sin(2 * np.pi * t / period)
+    quat[:, head] = quat_mul(quat_about(2, yaw), quat[:, head])
+    return replace(clip, quat=quat)
+
+
+ASIDE, IN_TURN = 45.0, (2.0, 6.0)  # degrees at most; s from left to left.  ASSUMED
 FASTEST = 4.0  # m/s, ASSUMED: the fastest second of Bandai's runs
 
 
@@ -157,13 +169,14 @@ def fastest_second(clip: Clip) -> float:
 
 def augment(
     clips: list[Clip], rng: np.random.Generator, speed=0.15, height=0.2, arms=0.2, trunk=(0.95, 1.45),
-    swing=(0.1, 1.6), bearing=1.0,
+    swing=(0.1, 1.6), bearing=1.0, looks=0.5,
 ) -> list[Clip]:  # fmt: skip
     """Every clip, and its mirror image with another bearing at a random speed by a user of random height, arm and trunk
-    length.
+    length, who may look about.
 
     Args      speed, height, arms : ranges, as shares: speed in 1 +- speed, and so on; trunk : least and most, not even
-              about 1 because the trunk of Bandai's actor is short (`resize`); swing, bearing : of `restyle`
+              about 1 because the trunk of Bandai's actor is short (`resize`); swing, bearing : of `restyle`;
+              looks : share of them who look left and right all the time (`looking`), by ASIDE or less
     ASSUMED   nobody's fastest second exceeds FASTEST, whatever the drawn speed: no policy follows that, and `--balance`
               would spend its time on it
     Returns   twice as many clips, the given ones first
@@ -172,8 +185,10 @@ def augment(
     draw = lambda r: float(rng.uniform(1.0 - r, 1.0 + r))  # noqa: E731
     users = [(draw(speed), draw(height), draw(arms), float(rng.uniform(*trunk))) for _ in clips]
     pace = [min(v, FASTEST / max(h * fastest_second(c), 1e-6)) for c, (v, h, *_) in zip(clips, users, strict=True)]
+    aside = [(rng.uniform(0.0, ASIDE) * (rng.random() < looks), rng.uniform(*IN_TURN)) for _ in clips]
     other = (warp(restyle(mirror(c), rng, swing, bearing), v) for c, v in zip(clips, pace, strict=True))
-    return list(clips) + [resize(c, *user) for c, (_, *user) in zip(other, users, strict=True)]
+    about = (looking(c, *a) for c, a in zip(other, aside, strict=True))
+    return list(clips) + [resize(c, *user) for c, (_, *user) in zip(about, users, strict=True)]
 
 
 # ------------------------------------------------------------------------------------ standing before and after

@@ -18,6 +18,7 @@ from headset.player import ride, stream_of
 from headset.reader import controllers_hang
 from human import heading
 from mocap import bvh, data
+from mocap.augment import looking
 from plumbing import render
 from plumbing.cli import UserError
 from plumbing.runs import save_checkpoint
@@ -519,7 +520,7 @@ def test_figure(two, figure, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(play, "comparison_sheet", small)
     assert play.main(["--figure", "6", "--png", str(tmp_path / "f.png"), "--seconds", "1", "--threads", "1"]) == 0
     [arm, _] = metrics.arms_of([figure], play.Options(compare=tuple(map(str, two)), threads=1))
-    row = metrics.streamed(arm.char, arm.policy.mean_action, [figure], arm.devices, 1)
+    row = metrics.streamed(arm.char, arm.policy.mean_action, [looking(figure)], arm.devices, 1)
     said = capsys.readouterr().out
     assert f"| root cm | {row['root_cm']:.1f} |" in said and "| joints cm |" not in said
     options = play.Options(figure=6, compare=tuple(map(str, two)), rows=("streamed",), threads=1, seconds=1.0)

@@ -13,6 +13,7 @@ from extras import users
 from headset.player import ride, stream_of
 from human import SEG, headset_height, sensors
 from mocap import data
+from mocap.augment import looking
 from plumbing.cli import run_main
 
 
@@ -53,8 +54,10 @@ def test_rows(clip):
     paces = users.users(users.Options(by="pace"))
     lengths = [len(f([clip])[0]) for f in paces.values()]
     assert list(paces)[-1] == "2 of the pace" and lengths == [79, 60, 48, 40, 30]  # 59 intervals ÷ s
-    tilts = users.users(users.Options(by="tilt"))
-    assert list(tilts) == ["head -20°", "head -10°", "head +0°", "head +10°", "head +20°"]
+    tilts = users.users(users.Options(by="head"))
+    looks = ["looks 20° aside", "looks 40° aside"]
+    assert list(tilts) == ["head -20°", "head -10°", "head +0°", "head +10°", "head +20°", *looks]
+    np.testing.assert_array_equal(tilts[looks[1]]([clip])[0].quat, looking(clip, 40.0).quat)
     np.testing.assert_array_equal(tilts["head -20°"]([clip])[0].quat, users.tilted(clip, -20.0).quat)
     same, cross = users.users(users.Options(by="crossing")).values()
     names = [c.name for c in cross([replace(clip, name=n) for n in "abcde"])]
@@ -86,7 +89,7 @@ def test_pushes():
     for k in range(6000):
         moved = moved + push.force(k * dt, 0.0) / float(char.model.body_mass.sum()) * dt
     np.testing.assert_allclose(moved, [0.0, 0.5, 0.0], atol=1e-3)
-    assert users.pushes(char, users.Options(by="tilt")) == {"": None}
+    assert users.pushes(char, users.Options(by="head")) == {"": None}
 
 
 def test_pushed_while_played(clip):

@@ -959,6 +959,19 @@ def test_mirror():
     np.testing.assert_array_equal(again.quat, clip.quat)
 
 
+def test_looking():
+    """SciPy's turn of the head about the vertical: none at first, to the left after a quarter; nothing else moves."""
+    clip = walk(seed=7)
+    other, head = augment.looking(clip, 30.0, 2.0), SEG["head"]
+    turn = (rot(other.quat[:, head]) * rot(clip.quat[:, head]).inv()).as_rotvec(degrees=True)
+    t = np.arange(len(clip)) / clip.rate
+    np.testing.assert_allclose(turn[:, 2], 30.0 * np.sin(np.pi * t), atol=1e-6)
+    np.testing.assert_allclose(turn[:, :2], 0.0, atol=1e-6)
+    rest = [i for i in range(len(SEG)) if i != head]
+    np.testing.assert_array_equal(other.quat[:, rest], clip.quat[:, rest])
+    np.testing.assert_array_equal(other.pos, clip.pos)
+
+
 @pytest.mark.parametrize("speed", [0.85, 1.0, 1.15])
 def test_warp(speed):
     clip = walk(seed=6)
@@ -1102,8 +1115,15 @@ def test_augment():
     assert all(augment.fastest_second(c) > 3.4 for c in sprint)
     fast = [augment.fastest_second(c) for s in range(6) for c in augment.augment(sprint, np.random.default_rng(s))[2:]]
     assert max(fast) < 1.02 * augment.FASTEST and min(fast) < 0.95 * augment.FASTEST
-    plain = augment.augment(clips, np.random.default_rng(3), 0, 0, 0, (1, 1), (1, 1), 0)
+    plain = augment.augment(clips, np.random.default_rng(3), 0, 0, 0, (1, 1), (1, 1), 0, 0)
     assert_same(plain[2], augment.mirror(clips[0]))
+    turned = []
+    for seed in range(20):
+        _, _, *others = augment.augment(clips, np.random.default_rng(seed), 0, 0, 0, (1, 1), (1, 1), 0)
+        for clip, other in zip(clips, others, strict=True):
+            head = rot(other.quat[:, SEG["head"]]) * rot(augment.mirror(clip).quat[:, SEG["head"]]).inv()
+            turned.append(np.rad2deg(head.magnitude().max()))
+    assert 0.2 < np.mean(np.array(turned) > 1.0) < 0.8 and 20.0 < max(turned) <= augment.ASIDE  # about half look about
 
 
 # ------------------------------------------------------------------------------------ standing before and after
