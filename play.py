@@ -318,7 +318,7 @@ def _open_viewer(model, data, root, how, port):
 # ------------------------------------------------------------------------------------ figures of the paper
 
 USER = "walk_105"  # the built-in walk of the figures, unless --motion or --clips says another
-LOOKS = (6,)  # figures of whose own user the head turns, as that of the paper's
+LOOKS = (6,)  # figures whose own user looks about, as the paper's does
 
 
 def figure_options(opt: Options, argv) -> Options:
