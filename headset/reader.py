@@ -8,7 +8,7 @@ import re
 import sys
 import threading
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -430,6 +430,7 @@ STEP = 0.2  # m between two samples of a headset: too fast for a head
 JUMP = 0.5  # m between two samples of a controller: too fast for a hand
 SETTLE = 0.1  # s that a controller which jumped must stay where it is
 HOLD, RELAX = 1.0, 0.5  # s that a lost controller is held; time constant with which it then sinks
+COAST, SMOOTH = 0.5, 0.15  # s: time constants with which a lost headset slows down, and its velocity is taken
 BLEND, CATCH_UP = 0.3, 2.0  # s, m/s: the way back from the held to the true pose
 CLOCK_AHEAD, CLOCK_BACK = 5.0, 1.0  # s: farther jumps of the time column are another clock
 # The hanging hand in the headset's heading frame [m], of a user of 1.75 m (the built-in human).  ASSUMED
@@ -498,8 +499,9 @@ class Track:
 
     raw: np.ndarray | None = None  # (7,) of the last usable row, as it came
     changed: float = -np.inf  # s, when raw last changed
-    good: np.ndarray | None = None  # (3,) last position taken as true, anchored world
+    good: np.ndarray | None = None  # (3,) last position taken as true, anchored world; of a lost headset, and its way
     yaw: float = 0.0  # its heading
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))  # of the headset, horizontally [m/s]
     lost: str | None = "not seen"  # why, or None
     since: float = 0.0  # s, lost since
     jumped: np.ndarray | None = None  # (3,) where a controller jumped to
@@ -528,8 +530,9 @@ class Guard:
               100 m away; when it has not changed for 0.25 s while another one moved; a controller also when it is
               1.5 m from the headset, or moved by more than 0.5 m between two rows, until it has stayed there for
               0.1 s.  More than 0.1 s without a row: all are lost
-    Hold      a lost headset stays where it was.  A lost controller keeps its place relative to the headset; after 1 s
-              it sinks to hang beside the body (time constant 0.5 s)
+    Hold      a lost headset goes on as it went, horizontally and ever slower (time constant 0.5 s: 0.6 m in all at a
+              walk's 1.2 m/s), for its user does not stop.  A lost controller keeps its place relative to the headset;
+              after 1 s it sinks to hang beside the body (time constant 0.5 s)
     Return    from the held to the true pose in as long as it was lost, in 0.3 s at most, or at 2 m/s if that is
               longer; in 0.3 s a headset after a step of more than 0.2 m between two rows, too
     Anchor    a headset that comes back, or moves between two rows, by more than 1 m has been teleported: the whole
@@ -539,7 +542,7 @@ class Guard:
     Frame     `to_world`'s, quaternion w, x, y, z; times from `Clock`
     Test      tests/headset/test_stream.py::test_zero_rows, test_nan_rows, test_frozen_sensor, test_drop_out,
               test_teleport,
-              test_controller_glitch, test_never_nan
+              test_controller_glitch, test_coast, test_never_nan
     """
 
     def __init__(self, rate=CONTROL_RATE, devices=3):
@@ -644,7 +647,10 @@ class Guard:
                 self.events[DEVICES[i], bad] += 1
             self.seconds[DEVICES[i], bad] += dt
             track.lost, track.mix = bad, 0.0
-            if i and t - track.since > HOLD:
+            if i == 0:  # the way of v e^{-s / COAST} since the row before
+                way = track.velocity * (COAST * np.exp(-(t - track.since) / COAST) * np.expm1(dt / COAST))
+                track.held, track.good = (track.held[0] + way, track.held[1]), track.good + way
+            elif t - track.since > HOLD:
                 share = 1.0 - np.exp(-dt / RELAX)
                 track.held = blend(track.held, (NEUTRAL[i], np.array([1.0, 0, 0, 0])), share)
             track.last = track.held
@@ -657,6 +663,9 @@ class Guard:
                 track.held, track.mix = track.last, 0.0
                 fade = BLEND if step else min(BLEND, max(t - track.since, 1e-6))
                 track.pace = 1.0 / max(fade, np.linalg.norm(own[0] - track.held[0]) / CATCH_UP)
+            if i == 0 and track.lost is None and track.good is not None and dt > 0 and not step:
+                fresh = (true[0] - track.good) / dt * [1.0, 1.0, 0.0]
+                track.velocity = track.velocity + (1.0 - np.exp(-dt / SMOOTH)) * (fresh - track.velocity)
             track.lost, track.good = None, true[0]
             track.mix = min(1.0, track.mix + dt * track.pace)
             track.last = own if track.mix >= 1.0 else blend(track.held, own, track.mix)

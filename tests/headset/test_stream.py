@@ -28,6 +28,7 @@ from headset.calibration import Calibration, Resampler, Stream
 from headset.player import Pace, Player, drive, ride, stream_of
 from headset.reader import (
     AXES,
+    COAST,
     COLUMNS,
     DEVICES,
     GRIP,
@@ -414,7 +415,7 @@ def test_zero_rows(device):
     out, guard = guarded(samples)
     assert steps(out, device) < 0.02
     if device == 0:
-        assert all(np.array_equal(out[k].pos[0], out[99].pos[0]) for k in lost)
+        assert all(np.linalg.norm(out[k].pos[0] - out[99].pos[0]) < 0.01 for k in lost)  # it sways, and coasts so far
     assert np.allclose(out[-1].pos, samples[-1].pos) and guard.live(device)
     assert guard.report() == [f"{DEVICES[device]} all zero: 1 time, 0.33 s"]
     first, _ = guarded(with_rows(standing(), range(5), 0, np.zeros(3), np.zeros(4)))
@@ -458,9 +459,22 @@ def test_drop_out():
     assert guard.events["head", "drop-out"] == 1 and not guard.events["head", "teleport"]
     assert np.diff([s.t for s in out]).max() < 0.04
     held = [s for s in out if samples[119].t < s.t < samples[120].t]
-    assert len(held) >= 29 and all(np.allclose(s.pos, out[119].pos) for s in held)
+    assert len(held) >= 29 and all(np.allclose(s.pos, out[119].pos, atol=0.015) for s in held)  # it sways
     speed = np.linalg.norm(np.diff([s.pos[0] for s in out], axis=0), axis=-1) / np.diff([s.t for s in out])
     assert speed.max() < 2.5 and np.allclose(out[-1].pos, samples[-1].pos)
+
+
+def test_coast():
+    """A headset lost on a walk goes on by v τ (1 − e^{−t/τ}), hands with it; one that stood stays; both come back."""
+    calm = [Sample(s.t, NEUTRAL + [0.0, 0.0, 1.65], np.tile([1.0, 0, 0, 0], (3, 1))) for s in standing(4)]
+    for speed in (1.2, 0.0):
+        samples = [Sample(s.t, s.pos + [0.0, speed * s.t, 0.0], s.quat) for s in calm]
+        out, guard = guarded(with_rows(samples, range(180, 270), slice(0, 3), np.zeros(3), np.zeros(4)))
+        assert guard.events["head", "all zero"] == 1
+        for s in out[180:270]:
+            way = speed * COAST * -np.expm1(-(s.t - out[179].t) / COAST)
+            np.testing.assert_allclose(s.pos - out[179].pos, np.tile([0.0, way, 0.0], (3, 1)), atol=0.01 * speed + 1e-9)
+        assert np.allclose(out[-1].pos, samples[-1].pos) and steps(out, 0) < 0.055  # CATCH_UP, and the user walks on
 
 
 def test_teleport():

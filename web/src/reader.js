@@ -293,6 +293,7 @@ const STEP = 0.2; // m between two samples of a headset: too fast for a head
 const JUMP = 0.5; // m between two samples of a controller: too fast for a hand
 const SETTLE = 0.1; // s that a controller which jumped must stay where it is
 const [HOLD, RELAX] = [1.0, 0.5]; // s that a lost controller is held; time constant with which it then sinks
+const [COAST, SMOOTH] = [0.5, 0.15]; // s: time constants with which a lost headset slows down, its velocity is taken
 const [BLEND, CATCH_UP] = [0.3, 2.0]; // s, m/s: the way back from the held to the true pose
 const [CLOCK_AHEAD, CLOCK_BACK] = [5, 1]; // s: farther jumps of the time column are another clock
 const NEUTRAL = [[0, 0, 0], [-0.04, 0.26, -0.9], [-0.04, -0.26, -0.9]]; // m, the hanging hand.  ASSUMED
@@ -343,7 +344,7 @@ export function fault(row, far = FAR_AWAY) { // reader.fault: why a device's row
 
 const newTrack = () => ({ // reader.Track
   raw: null, changed: -Infinity, good: null, yaw: 0, lost: 'not seen', since: 0, jumped: null, settling: 0, last: null,
-  held: null, mix: 1, pace: 0,
+  held: null, mix: 1, pace: 0, velocity: [0, 0, 0],
 });
 
 export class Guard { // reader.Guard: three devices that may be lost at any time -> three finite poses
@@ -438,7 +439,11 @@ export class Guard { // reader.Guard: three devices that may be lost at any time
       if (track.lost === null || track.held === null) [track.held, track.since] = [track.last, t];
       if (track.lost !== bad) this.count(DEVICES[i], bad);
       [track.lost, track.mix] = [bad, 0];
-      if (i && t - track.since > HOLD) {
+      if (i === 0) { // the way of v e^(-s / COAST) since the row before
+        const way = COAST * Math.exp(-(t - track.since) / COAST) * Math.expm1(dt / COAST);
+        const on = (x, k) => x + way * track.velocity[k];
+        [track.held, track.good] = [[track.held[0].map(on), track.held[1]], track.good.map(on)];
+      } else if (t - track.since > HOLD) {
         track.held = blend(track.held, [NEUTRAL[i], IDENTITY], 1 - Math.exp(-dt / RELAX));
       }
       track.last = track.held;
@@ -450,6 +455,10 @@ export class Guard { // reader.Guard: three devices that may be lost at any time
         [track.held, track.mix] = [track.last, 0];
         const fade = step ? BLEND : Math.min(BLEND, Math.max(t - track.since, 1e-6));
         track.pace = 1 / Math.max(fade, distance(own[0], track.held[0]) / CATCH_UP);
+      }
+      if (i === 0 && track.lost === null && track.good !== null && dt > 0 && !step) {
+        const fresh = truth[0].map((x, k) => (k < 2 ? (x - track.good[k]) / dt : 0));
+        track.velocity = track.velocity.map((v, k) => v + (1 - Math.exp(-dt / SMOOTH)) * (fresh[k] - v));
       }
       [track.lost, track.good] = [null, truth[0]];
       track.mix = Math.min(1, track.mix + dt * track.pace);
