@@ -143,7 +143,7 @@ def restyle(clip: Clip, rng: np.random.Generator, swing=(0.1, 1.6), bearing=1.0)
     return replace(clip, name=f"{clip.name}-restyled", pos=pos, quat=quat_continuous(quat))
 
 
-def looking(clip: Clip, degrees=40.0, period=3.0) -> Clip:
+def looking(clip: Clip, degrees=20.0, period=3.0) -> Clip:
     r"""The same by a user who looks to the left and to the right, in turn.
 
     Equation  R' = R_z(a sin(2π t / T)) R_head about the head's joint, a `degrees`, T `period` [s]
