@@ -526,13 +526,12 @@ def streamed(char: Character, act, clips, devices=3, threads=0, sensors=None) ->
     scale = np.concatenate([np.tile(s[3], (len(s[2]), 1)) for s in streams])
     ref = replace(ref, sensor_pos=pos, sensor_quat=quat, sensor_scale=scale.astype(np.float32))
     rides = ride(char, act, [s[:2] for s in streams], devices, threads)
-    pieces, first = [], []
+    pieces = []
     for start, r in zip(ref.first, rides, strict=True):
         for a, b in r.lives:
             parts = (v[a:b] for v in (r.qpos, r.contact, r.action))
             pieces.append(Recording(start + np.arange(a, b), *parts, r.failures > 0, b - a))
-        first.append(r.first)
-    failed = np.array([r.failures > 0 for r in rides])
+    failed, first = np.array([r.failures > 0 for r in rides]), np.array([r.first for r in rides])
     failures, ticks = sum(r.failures for r in rides), np.array([len(r.qpos) for r in rides])
     row = measure(char, ref, pieces)
     whole = {k: row[k] * len(pieces) / len(clips) for k in ("success_phc", "success_height")}  # of captures, not lives
@@ -541,10 +540,10 @@ def streamed(char: Character, act, clips, devices=3, threads=0, sensors=None) ->
         "seconds": ticks.sum() / ref.rate,
         "completed": float(np.mean(~failed)),
         "within_1m": float(np.mean([r.failures == 0 and r.farthest <= AWAY for r in rides])),
-        "survival": float(np.mean(np.array(first) / ticks)),
+        "survival": float(np.mean(first / ticks)),
         "failures": failures,
         "fails_every_s": ticks.sum() / ref.rate / failures if failures else float("inf"),
-        "first_failure_s": float(np.median(np.array(first)[failed]) / ref.rate) if failed.any() else float("inf"),
+        "first_failure_s": float(np.median(first[failed]) / ref.rate) if failed.any() else float("inf"),
     }
 
 
@@ -688,7 +687,6 @@ def run(opt: Options) -> None:
 
 
 # ------------------------------------------------------------------------------------ comparing
-
 
 @dataclass
 class Arm:

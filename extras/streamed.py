@@ -92,7 +92,7 @@ def captures_of(one: Set, folder: Path, half: str) -> list:
     if motion != one.folder and not os.path.isdir(motion):
         return []
     half = "both" if one.whole and half == "report" else half
-    how = dict(split="validation", all=True) if one.split == "all" else dict(split=one.split)
+    how = dict(all=True) if one.split == "all" else dict(split=one.split)
     return metrics.captures_of(metrics.Options(motion=motion, clips=one.clips, half=half, **how))
 
 

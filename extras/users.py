@@ -28,7 +28,7 @@ import numpy as np
 import metrics
 from character import Character
 from headset.player import Player, ride, stream_of
-from human import SEG, SENSOR_OFFSETS, headset_height, quat_conj, quat_mul, quat_rotate
+from human import SEG, SENSOR_OFFSETS, headset_height, quat_about, quat_conj, quat_mul, quat_rotate
 from mocap.augment import looking, resize, warp
 from mocap.data import CONTROL_RATE, parts
 from play import slides_of
@@ -102,8 +102,8 @@ def tilted(clip, degrees):
     Equation  R' = R_head R_y(degrees), about the head's joint: the eyes move with it, by 2 cm at 10°
     Why       nobody wears a headset as another does, or holds the head so, and nothing in it tells which
     Test      tests/extras/test_users.py::test_tilted"""
-    half, quat, head = np.deg2rad(degrees) / 2, clip.quat.copy(), SEG["head"]
-    quat[:, head] = quat_mul(quat[:, head], np.array([np.cos(half), 0.0, np.sin(half), 0.0]))
+    quat, head = clip.quat.copy(), SEG["head"]
+    quat[:, head] = quat_mul(quat[:, head], quat_about(1, np.deg2rad(degrees)))
     return replace(clip, quat=quat)
 
 
@@ -134,10 +134,10 @@ def pushes(char: Character, opt: Options) -> dict:
 
     Equation  F = m Δv / PUSH_SECONDS, m the character's mass
     Test      tests/extras/test_users.py::test_pushes"""
-    mass, none = char.model.body_subtreemass[char.root], {"": None}
     if opt.by != "push":
-        return none
-    return none | {
+        return {"": None}
+    mass = char.model.body_subtreemass[char.root]
+    return {"": None} | {
         f", {name} by {size:g} m/s": metrics.Push(mass * size / metrics.PUSH_SECONDS, PUSHED_AT, angle)
         for size in PUSHES
         for name, angle in metrics.DIRECTIONS.items()
@@ -201,7 +201,7 @@ def main(argv=None):
     policies = [find_policy(metrics.Options(character=name)) for name in opt.characters]
     check_folders(opt.json, read=(*parts(opt.motion), *(path for _, path, _ in policies)))
     asked = {f.name: getattr(opt, f.name) for f in fields(metrics.MotionFlags)}
-    captures, _ = metrics.motion_of(metrics.Options(**asked, split=opt.split, half=opt.half))
+    captures = metrics.captures_of(metrics.Options(**asked, split=opt.split, half=opt.half))
     print(markdown([["", *(k.replace("_", " ") for k in COLUMNS)]]), flush=True)
     out = {}
     for name, (policy, path, meta) in zip(opt.characters, policies, strict=True):

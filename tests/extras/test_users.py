@@ -137,7 +137,7 @@ def test_row(clip):
 
 def test_command(clip, tmp_path, monkeypatch, capsys):
     """A line for every character and user, as JSON too; a wrong split is said in a line."""
-    monkeypatch.setattr(metrics, "motion_of", lambda opt: ([clip], []))
+    monkeypatch.setattr(metrics, "captures_of", lambda opt: [clip])
     flags = ["--heights", "1.5", "--threads", "1", "--json", str(tmp_path / "u.json")]
     users.main(["--characters", "oppy", *flags])
     out, found = capsys.readouterr().out, json.loads((tmp_path / "u.json").read_text())
