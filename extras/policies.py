@@ -1,13 +1,14 @@
-r"""Policies made of policies: shipped, averaged, carried over to another body.
+r"""Policies made of policies: shipped, averaged, joined, carried over to another body.
 
     python -m extras.policies ship RUN OUT.npz                         the policy of a run, with its data's licence
     python -m extras.policies blend OUT.npz A B … --share 0.3          A's weights averaged with those of the others
     python -m extras.policies ship OLD.npz NEW.npz --lead 0.07         is shown its user 0.07 s ahead: is less late
+    python -m extras.policies join OUT.npz A B --motors 'elbow_*'      one network of two: A's elbows, all else B's
     python -m extras.policies carry OLD.npz NEW.npz --character dino   to go on with as another character, another
                                                                        variation, with other sensors or wider layers
 
 `carry` keeps what both have names for, and what an action did: where the limit or the spring of a joint has changed,
-the same torque is asked for.  `ppo.py --init NEW.npz` then goes on from it.
+the same torque is asked for.  `ppo.py --init NEW.npz` then goes on from it, as from what `join` made.
 
 [Wortsman22]  Wortsman et al., Model soups: averaging weights of multiple fine-tuned models, ICML 2022
 """
@@ -15,9 +16,11 @@ the same torque is asked for.  `ppo.py --init NEW.npz` then goes on from it.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields, replace
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import block_diag
 
 import character
 from character import Character
@@ -194,11 +197,92 @@ def ship(run, path, blend=(), share=0.5, gain=1.0, lead=0.0) -> dict:
     lead += before[0] if not blend else (1.0 - share) * before[0] + share * float(np.mean(before[1:]))
     gain *= meta.get("gain", 1.0)
     kept |= ({"gain": gain} if gain != 1.0 else {}) | ({"lead": round(lead, 4)} if lead else {})
-    kept |= {k: meta[k] for k in ("carried", "blend") if k in meta}
+    kept |= {k: meta[k] for k in ("carried", "blend", "joined") if k in meta}
     if blend:
         kept["blend"] = {"with": [Path(p).name for p in blend], "share": share}
     kept |= {"licence": each_once(licences) or "MIT", "versions": versions(), "git": git_state()}
     save_checkpoint(path, policy.arrays(), kept)
+    return kept
+
+
+# ------------------------------------------------------------------------------------ join
+
+
+def joined(one: Policy, other: Policy, inputs, own) -> Policy:
+    r"""One network of two: the hidden units of both beside one another, some outputs from those of one, the rest from
+    those of the other.
+
+    Equation  every layer is [[W, 0], [0, W']]; of the last a column is (W_i, 0) or (0, W'_i).  The other's first layer
+              reads one's normalised inputs: W'_k s'_k / s_j, b' + Σ_k W'_k s'_k (μ_j − μ'_k), j = inputs[k]
+    Symbols   s, μ the inverse deviations and means of the two normalisers, of which the clipping is left aside
+    Why       legs that learnt without arms keep their feet under raised arms, and arms learn beside them: what one
+              policy knows is kept whole where two that are no relations cannot be averaged (`blended`)
+    Args      inputs : (other.obs_size,) which of one's inputs each of the other's is; own : (u,) bool, one's outputs
+    Returns   Policy with one's critic, normaliser and σ
+    Raises    ValueError: other outputs, another depth or activation
+    Test      tests/extras/test_policies.py::test_joined
+    """
+    same = [(len(p.hidden), p.action_size, p.activation) for p in (one, other)]
+    if same[0] != same[1]:
+        raise ValueError(f"layers, outputs and activation {same[1]}, expected {same[0]}")
+    hidden = tuple(a + b for a, b in zip(one.hidden, other.hidden, strict=True))
+    sizes = one.obs_size, one.critic_size, one.action_size, hidden, one.value_hidden
+    out = Policy(*sizes, 1.0, one.value_scale, np.random.default_rng(0), one.theta_pi.dtype, one.activation)
+    a, b, c = one.actor.params, {k: v.astype(float) for k, v in other.actor.params.items()}, out.actor.params
+    inverse, theirs, inputs = one.norm.inv_std.astype(float), other.norm.inv_std.astype(float), np.asarray(inputs)
+    k = np.arange(len(inputs))
+    b["b0"] = b["b0"] + (theirs[k] * (one.norm.mean[inputs] - other.norm.mean[k])) @ b["W0"]
+    first = np.zeros((one.obs_size, other.hidden[0]))
+    first[inputs] = b["W0"] * (theirs[k] / inverse[inputs])[:, None]
+    last = out.actor.n_layers - 1
+    c["W0"][:] = np.hstack([a["W0"], first])
+    for i in range(1, last):
+        c[f"W{i}"][:] = block_diag(a[f"W{i}"], b[f"W{i}"])
+    for i in range(last):
+        c[f"b{i}"][:] = np.concatenate([a[f"b{i}"], b[f"b{i}"]])
+    c[f"W{last}"][:] = np.vstack([a[f"W{last}"] * own, b[f"W{last}"] * ~np.asarray(own)])
+    c[f"b{last}"][:] = np.where(own, a[f"b{last}"], b[f"b{last}"])
+    out.log_std[:] = one.log_std
+    out.critic.theta[:] = one.critic.theta
+    out.norm.load_state(one.norm.state())
+    return out
+
+
+def join(out_path, one_path, other_path, motors) -> dict:
+    """Write one network of two policies of a character (`joined`).  -> what its file says
+
+    Args      motors : patterns of hinges, as in 'shoulder_*': those act by the first policy, the rest by the second,
+              which may know the headset alone
+    Raises    UserError: another body, a pattern that no motor or every motor fits, inputs that the first does not have,
+              a policy that is shown its user ahead
+    Test      tests/extras/test_policies.py::test_join_command"""
+    (one, meta), (other, its) = load_policy(one_path), load_policy(other_path)
+    bodies = _body(meta, one_path), _body(its, other_path)
+    if not all(bodies) or bodies[0] != bodies[1]:
+        raise UserError(f"{other_path}: of the body {bodies[1]}; valid: as {one_path}, {bodies[0]}")
+    for path, m in ((one_path, meta), (other_path, its)):
+        if lead := m.get("lead"):  # PPO that goes on unlearns it
+            undo = f"ship {path} NEW.npz --lead {-lead:g}"
+            raise UserError(f"{path}: is shown its user {lead:g} s ahead; valid: without, as by {undo}")
+    char = trained_as(meta, one_path).load()
+    names = [char.hinges[h] for h in char.driven]
+    own = np.array([any(fnmatch(name, pattern) for pattern in motors) for name in names])
+    if own.all() or not own.any():
+        raise UserError(f"--motors {','.join(motors)}: {own.sum()} of the motors; valid: some of {', '.join(names)}")
+    have, need = (input_names(char, devices_of(m, p, None), False) for m, p in ((meta, one_path), (its, other_path)))
+    if lacking := [n for n in need if n not in have]:
+        raise UserError(f"{other_path}: sees {lacking[0]}, which {one_path} does not; valid: in the other order")
+    try:
+        policy = joined(one, other, [have.index(n) for n in need], own)
+    except ValueError as e:
+        raise UserError(f"join {one_path} {other_path}: {e}; valid: networks of as many layers") from None
+    kept = {k: meta[k] for k in ("data", "steps") if k in meta} | {"policy": policy.shape()}
+    kept["steps"] = total_steps(meta)
+    kept["options"] = meta["options"] | {"hidden": list(policy.hidden), "init": None, "out": None}
+    kept["licence"] = each_once(licences_of(meta, one_path) + licences_of(its, other_path)) or "MIT"
+    kept["joined"] = {"with": Path(other_path).name, "motors": list(motors)}
+    kept |= {"versions": versions(), "git": git_state()}
+    save_checkpoint(out_path, policy.arrays(), kept)
     return kept
 
 
@@ -381,6 +465,13 @@ class Blend:
 
 
 @dataclass
+class Join:
+    """What `join` can be told."""
+
+    motors: tuple[str, ...] = arg((), "names of hinges, with * and ?: those of A's network act, of all others B's")
+
+
+@dataclass
 class Carry(character.Switches):
     """What `carry` can be told: the new body, by default the old one."""
 
@@ -415,25 +506,28 @@ def carry(old_path, new_path, opt: Carry, given=()) -> dict:
 
 
 def check_new(out) -> None:
-    """UserError: a policy is there already.  `blend` names OUT first: a slip of order would cost one of the averaged.
+    """UserError: a policy is there already.  `blend` and `join` name OUT first: a slip of order would cost a policy.
 
     Test      tests/extras/test_policies.py::test_nothing_is_overwritten"""
     if Path(out).exists():
-        raise UserError(f"{out} exists already: valid: the name of a new file (of blend it stands first)")
+        raise UserError(f"{out} exists already: valid: the name of a new file (of blend and join it stands first)")
 
 
-WORDS = {"ship": (2, 2), "carry": (2, 2), "blend": (3, 100)}  # how many files each command wants, least and most
+WORDS = {"ship": (2, 2), "carry": (2, 2), "join": (3, 3), "blend": (3, 100)}  # files a command wants, least and most
 
 
 def main(argv=None):
-    """Ship, blend or carry.  Test: tests/extras/test_policies.py::test_carry_command, test_ship, test_wrong_commands"""
+    """Ship, blend, join or carry.
+
+    Test      tests/extras/test_policies.py::test_carry_command, test_join_command, test_ship, test_wrong_commands"""
     words, flags = words_first(argv)
     what, files = (words[0], words[1:]) if words else ("", [])
     if not {"-h", "--help"} & set(flags):
         least, most = WORDS.get(what, (1, 0))
         if not least <= len(files) <= most:
             asked = " ".join(words) or "no command"
-            raise UserError(f"{asked}: valid: ship RUN OUT.npz, blend OUT.npz A B …, carry OLD.npz NEW.npz, then flags")
+            ways = "ship RUN OUT.npz, blend OUT.npz A B …, join OUT.npz A B, carry OLD.npz NEW.npz"
+            raise UserError(f"{asked}: valid: {ways}, then flags")
     if what == "carry":
         opt = cli(Carry, flags, "extras.policies carry OLD.npz NEW.npz", __doc__)
         check_folders(files[1], read=files[:1])
@@ -441,7 +535,14 @@ def main(argv=None):
         meta = carry(*files, opt, given_flags(flags))
         print(f"{files[1]}: {meta['options']['character']}, {fmt_count(meta['steps'])} steps before")
         return
-    opt = cli(Blend, flags, f"extras.policies {what or 'ship|blend|carry'} FILE …", __doc__)
+    if what == "join":
+        opt = cli(Join, flags, "extras.policies join OUT.npz A B", __doc__)
+        check_folders(files[0], read=files[1:])
+        check_new(files[0])
+        meta = join(*files, opt.motors)
+        print(f"{files[0]}: {', '.join(opt.motors)} of {files[1]}, the rest of {files[2]}; {meta['licence']}")
+        return
+    opt = cli(Blend, flags, f"extras.policies {what or 'ship|blend|join|carry'} FILE …", __doc__)
     if what == "ship" and "share" in given_flags(flags):
         raise UserError("--share is of blend OUT.npz A B …: leave it out")
     run, out, *others = files if what == "ship" else [files[1], files[0], *files[2:]]

@@ -275,6 +275,14 @@ def test_every_assumed_is_listed():
 # ------------------------------------------------------------------------------------ sizes and commands
 
 
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_no_section_twice(document):
+    """A section pasted twice tells two stories; LOG.md has its experiments by date."""
+    text = (ROOT / document).read_text()
+    headings = re.findall(r"^#{1,3} .*$", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S), flags=re.M)
+    assert [h for h in set(headings) if headings.count(h) > 1] == []
+
+
 def test_reproduce_is_short():
     """The paper's own document can be read in one sitting."""
     size = (ROOT / "REPRODUCE.md").stat().st_size

@@ -183,7 +183,7 @@ def test_nothing_is_overwritten(whole, tmp_path):  # noqa: F811
     for path in (a, b, c):
         policies.ship(whole, path)
     was = a.read_bytes()
-    for words in (["blend", a, b, c], ["ship", b, a], ["carry", b, a, "--sensors", "hmd"]):
+    for words in (["blend", a, b, c], ["join", a, b, c], ["ship", b, a], ["carry", b, a, "--sensors", "hmd"]):
         with pytest.raises(UserError, match="a.npz exists already: valid: the name of a new file"):
             policies.main([str(w) for w in words])
     assert a.read_bytes() == was
@@ -217,6 +217,61 @@ def test_led_by_command(whole, tmp_path, capsys):  # noqa: F811
     with pytest.raises(SystemExit):
         policies.main(["ship", str(whole), str(once), "--lead", "2"])
     assert "from -0.5 to 0.5 s" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------ join
+
+
+def test_joined():
+    """Some outputs are one policy's, the rest the other's, which reads some of the same inputs by other statistics."""
+    rng = np.random.default_rng(5)
+    one, other = Policy(7, 9, 4, (6, 5), (3,), 0.1, 2.0, rng), Policy(4, 5, 4, (8, 3), (2,), 0.2, 1.0, rng)
+    for policy in (one, other):
+        for net in (policy.actor, policy.critic):
+            net.theta[:] = rng.normal(size=net.theta.shape)
+        policy.norm.update(rng.normal(1.0, 2.0, (40, policy.critic_size)))
+    inputs, own = [6, 0, 3, 4], np.array([True, False, False, True])
+    both = policies.joined(one, other, inputs, own)
+    x = rng.normal(1.0, 1.0, (30, 9)).astype(np.float32)
+    asked = np.where(own, one.mean_action(x[:, :7]), other.mean_action(x[:, inputs]))
+    np.testing.assert_allclose(both.mean_action(x[:, :7]), asked, atol=1e-5)
+    np.testing.assert_allclose(both.value(both.norm.normalise(x)), one.value(one.norm.normalise(x)), rtol=1e-6)
+    np.testing.assert_array_equal(both.log_std, one.log_std)
+    assert both.hidden == (14, 8)
+    with pytest.raises(ValueError, match="expected .2, 4"):
+        policies.joined(one, Policy(4, 5, 4, (8,), (2,), 0.2, 1.0, rng), inputs, own)
+
+
+def test_join_command(whole, tmp_path, char, capsys):  # noqa: F811
+    """The arms of one policy and the rest of one that knows the headset alone; training goes on from it."""
+    hmd, out = str(tmp_path / "hmd.npz"), str(tmp_path / "both.npz")
+    policies.main(["carry", str(whole), hmd, "--sensors", "hmd"])
+    arms = ["--motors", "shoulder_*,elbow_*"]
+    policies.main(["join", out, str(whole), hmd, *arms])
+    assert "shoulder_*, elbow_* of" in capsys.readouterr().out
+    (a, _), (b, _), (both, meta) = (load_policy(p) for p in (whole, hmd, out))
+    names = input_names(char, asymmetric=False)
+    x = (a.norm.mean + np.random.default_rng(0).normal(size=(20, 459)) / a.norm.inv_std).astype(np.float32)[:, :189]
+    seen = [names.index(n) for n in input_names(char, 1, False)]
+    own = np.array([char.hinges[h].startswith(("shoulder", "elbow")) for h in char.driven])
+    asked = np.where(own, a.mean_action(x), b.mean_action(x[:, seen]))
+    np.testing.assert_allclose(both.mean_action(x), asked, atol=1e-5)
+    assert np.abs(a.mean_action(x) - b.mean_action(x[:, seen])).max() > 1e-4  # they do not agree by themselves
+    assert meta["joined"] == {"with": "hmd.npz", "motors": ["shoulder_*", "elbow_*"]}
+    hidden = ",".join(map(str, both.hidden))
+    assert train(tmp_path / "more", 1, "--init", out, "--hidden", hidden)[1]["before"] == meta["steps"]
+
+    led, new = str(tmp_path / "led.npz"), str(tmp_path / "new.npz")
+    policies.main(["ship", str(whole), led, "--lead", "0.05"])
+    for files, flags, line in (
+        ([hmd, str(whole)], arms, "sees user_previous.l.x, which .*hmd.npz does not"),
+        ([str(whole), hmd], ["--motors", "wing_*"], "--motors wing_.: 0 of the motors; valid: some of hip_l_y"),
+        ([str(whole), hmd], ["--motors", "*"], "33 of the motors"),
+        ([led, hmd], arms, "shown its user 0.05 s ahead; valid: .*--lead -0.05"),
+    ):
+        with pytest.raises(UserError, match=line):
+            policies.main(["join", new, *files, *flags])
+    assert not Path(new).exists()
 
 
 # ------------------------------------------------------------------------------------ carry
@@ -421,9 +476,9 @@ def test_carry_command(tmp_path, capsys):
 
 
 def test_wrong_commands(tmp_path, capsys):
-    for words in ([], ["shop"], ["ship", "a"], ["ship", "a", "b", "c"], ["blend", "a", "b"], ["carry", "a"]):
-        with pytest.raises(UserError, match="valid: ship RUN OUT.npz, blend OUT.npz A B …, carry OLD.npz NEW.npz"):
-            policies.main(words)
+    for words in ("", "shop", "ship a", "ship a b c", "blend a b", "join a b", "carry a"):
+        with pytest.raises(UserError, match="valid: ship RUN OUT.npz, blend OUT.npz A B …, join OUT.npz A B, carry "):
+            policies.main(words.split())
     with pytest.raises(SystemExit) as end:
         policies.main(["carry", "--help"])
     assert end.value.code == 0 and "--from-character" in capsys.readouterr().out
