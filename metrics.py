@@ -24,7 +24,7 @@ import numpy as np
 import mocap.data
 from character import Character, OwnShapes, Switches, driven_groups
 from env import EPISODE_STEPS, SENSORS, Env, headset_only
-from headset.player import AWAY, ride, stream_of
+from headset.player import AWAY, ride, stream_of, tally
 from headset.reader import controllers_hang
 from human import CONTACT_SPEED, angular_velocity, heading, quat_angle, quat_conj, quat_mul, quat_rotate, travelled
 from human import footfalls as footfalls_apart
@@ -531,20 +531,10 @@ def streamed(char: Character, act, clips, devices=3, threads=0, sensors=None) ->
         for a, b in r.lives:
             parts = (v[a:b] for v in (r.qpos, r.contact, r.action))
             pieces.append(Recording(start + np.arange(a, b), *parts, r.failures > 0, b - a))
-    failed, first = np.array([r.failures > 0 for r in rides]), np.array([r.first for r in rides])
-    failures, ticks = sum(r.failures for r in rides), np.array([len(r.qpos) for r in rides])
     row = measure(char, ref, pieces)
     whole = {k: row[k] * len(pieces) / len(clips) for k in ("success_phc", "success_height")}  # of captures, not lives
-    return row | whole | {
-        "clips": len(clips),
-        "seconds": ticks.sum() / ref.rate,
-        "completed": float(np.mean(~failed)),
-        "within_1m": float(np.mean([r.failures == 0 and r.farthest <= AWAY for r in rides])),
-        "survival": float(np.mean(first / ticks)),
-        "failures": failures,
-        "fails_every_s": ticks.sum() / ref.rate / failures if failures else float("inf"),
-        "first_failure_s": float(np.median(first[failed]) / ref.rate) if failed.any() else float("inf"),
-    }
+    within = [r.failures == 0 and r.farthest <= AWAY for r in rides]
+    return row | whole | tally(rides) | {"clips": len(clips), "within_1m": float(np.mean(within))}
 
 
 # ------------------------------------------------------------------------------------ which policy

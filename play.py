@@ -39,7 +39,7 @@ from env import EPISODE_STEPS, ROOT_LIMIT, Env
 from headset import axes, calibration
 from headset.axes import StreamFlags
 from headset.bsor import opened
-from headset.player import Pace, Player, drive, ride, stream_of
+from headset.player import Pace, Player, drive, ride, stream_of, tally
 from headset.reader import DEVICES, GAP, arriving, files_of, is_live, sound
 from human import heading, sensors
 from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_action, simulate
@@ -568,15 +568,11 @@ def summary_of(rides, slides, devices: int) -> dict:
 
     Args      slides : `slides_of` each
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
-    ticks = sum(len(r.qpos) for r in rides)
-    seconds, failures = ticks / CONTROL_RATE, sum(r.failures for r in rides)
-    slides = np.concatenate(slides)
+    counts, ticks, slides = tally(rides), sum(len(r.qpos) for r in rides), np.concatenate(slides)
     return {
-        "seconds": round(seconds, 3),
-        "completed": float(np.mean([r.failures == 0 for r in rides])),
-        "survival": float(np.mean([r.first / len(r.qpos) for r in rides])),
-        "failures": int(failures),
-        "fails_every_s": seconds / failures if failures else None,
+        "seconds": round(counts["seconds"], 3),
+        **{k: counts[k] for k in ("completed", "survival", "failures")},
+        "fails_every_s": counts["fails_every_s"] if counts["failures"] else None,
         "head_cm": 100 * sum(r.head for r in rides) / ticks,
         "hands_cm": 100 * sum(r.hands for r in rides) / ticks if devices == 3 else None,
         "own_slide_cm_s": 100 * float(slides.mean()) if len(slides) else None,

@@ -27,10 +27,10 @@ import numpy as np
 
 import metrics
 from character import Character
-from headset.player import Player, ride, stream_of
+from headset.player import Player, ride, stream_of, tally
 from human import SEG, SENSOR_OFFSETS, headset_height, quat_about, quat_conj, quat_mul, quat_rotate
 from mocap.augment import looking, resize, warp
-from mocap.data import CONTROL_RATE, parts
+from mocap.data import parts
 from play import slides_of
 from plumbing.cli import THREADS, UserError, arg, cell, cli, given_flags, markdown, run_main
 from plumbing.files import atomic_write, check_folders
@@ -158,16 +158,12 @@ def row_of_streams(char: Character, act, streams, devices, threads, push=None) -
     Errors    of headset and controllers over all frames [cm]; own slide without the jumps to where it is stood up
     Test      tests/extras/test_users.py::test_row"""
     rides = ride(char, act, streams, devices, threads, push.force if push else None)
-    ticks, failures = np.array([len(r.qpos) for r in rides]), np.array([r.failures for r in rides])
-    first = np.array([r.first for r in rides])
     ends, slides = sum((r.ends for r in rides), Counter()), np.concatenate([slides_of(char, r) for r in rides])
-    total = ticks.sum()
+    total = sum(len(r.qpos) for r in rides)
+    counts = tally(rides)
     return {
         "captures": len(rides),
-        "completed": float(np.mean(failures == 0)),
-        "survival": float(np.mean(first / ticks)),
-        "fails_every_s": total / CONTROL_RATE / failures.sum() if failures.any() else float("inf"),
-        "first_failure_s": float(np.median(first[failures > 0]) / CONTROL_RATE) if failures.any() else float("inf"),
+        **{k: counts[k] for k in ("completed", "survival", "fails_every_s", "first_failure_s")},
         "falls": ends["fall"],
         "lost": ends["away"],
         "diverged": ends["bad"],

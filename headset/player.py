@@ -200,6 +200,24 @@ class Ride:
         return list(zip(cuts[:-1], cuts[1:]))
 
 
+def tally(rides: list[Ride]) -> dict:
+    """How long several characters kept their feet: the counts of every streamed table.
+
+    completed, survival : means over rides, of whether and of how much of it before the first failure; seconds,
+    failures : sums; fails_every_s : seconds / failures; first_failure_s : median of those that failed; inf of none
+    Test      tests/headset/test_stream.py::test_tally"""
+    ticks, first, failures = (np.array(a) for a in zip(*((len(r.qpos), r.first, r.failures) for r in rides)))
+    seconds, failed = ticks.sum() / CONTROL_RATE, failures > 0
+    return {
+        "seconds": float(seconds),
+        "completed": float(np.mean(~failed)),
+        "survival": float(np.mean(first / ticks)),
+        "failures": int(failures.sum()),
+        "fails_every_s": float(seconds / failures.sum()) if failed.any() else float("inf"),
+        "first_failure_s": float(np.median(first[failed]) / CONTROL_RATE) if failed.any() else float("inf"),
+    }
+
+
 def ride(char: Character, act, streams, devices=3, threads=0, force=None) -> list[Ride]:
     """Drive one character a stream, side by side with those whose streams are about as long.
 

@@ -7,6 +7,7 @@ import re
 import sys
 import threading
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,7 +26,7 @@ from env import Env, headset_only, observation_terms
 from headset import calibration
 from headset.axes import Watch
 from headset.calibration import Calibration, Resampler, Stream
-from headset.player import Pace, Player, drive, ride, stream_of
+from headset.player import Pace, Player, Ride, drive, ride, stream_of, tally
 from headset.reader import (
     AXES,
     COAST,
@@ -863,6 +864,20 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
     for more in ([], ["--json", str(out)]):
         assert run(*common, "--stream", "x" * 300, *more) == 2
         assert "xxx: File name too long; valid: " in capsys.readouterr().err
+
+
+def test_tally():
+    """Three rides by hand: one falls twice, after 10 and 25 of 40 ticks, one after 30 of 60, one never in 20."""
+
+    def ridden(ticks, *cuts):
+        anew, empty = np.zeros(ticks, bool), np.zeros((ticks, 1))
+        anew[[0, *cuts]] = True
+        return Ride(empty, empty, empty, anew, Counter(fall=len(cuts)), 0.0, 0.0, 0.0)
+
+    found = tally([ridden(40, 10, 25), ridden(60, 30), ridden(20)])
+    asked = dict(seconds=4.0, completed=1 / 3, survival=(0.25 + 0.5 + 1.0) / 3, failures=3, fails_every_s=4 / 3)
+    assert found == pytest.approx(asked | dict(first_failure_s=20 / 30))
+    assert tally([ridden(20)])["fails_every_s"] == tally([ridden(20)])["first_failure_s"] == float("inf")
 
 
 def test_captures_far_away(jesse, walk):
