@@ -75,6 +75,11 @@ class Policy:
             "activation": self.activation,
         }
 
+    def summary(self) -> str:
+        """Inputs, actions and weights, for a run's first line."""
+        inputs = f"{self.obs_size} observations ({self.critic_size} for the critic), {self.action_size} actions"
+        return f"{inputs}; policy {self.actor.n_params:,} and critic {self.critic.n_params:,} weights"
+
     def load(self, arrays):
         """Take over what `arrays` returned.
 

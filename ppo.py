@@ -24,8 +24,7 @@ from pathlib import Path
 from statistics import fmean
 from types import SimpleNamespace
 
-# OpenBLAS's threads would take the cores from the physics, spinning while they wait, and from `aside`.
-# It must be said before NumPy is loaded.
+# OpenBLAS's threads would take the cores from physics and `aside`, spinning while they wait; said before NumPy loads
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
@@ -50,10 +49,7 @@ KNOWN = some_of(WITHOUT)
 
 @dataclass
 class Options(data.MotionFlags, character.Switches):
-    """Everything a run is made of.
-
-    Table 3 of the paper (its hyper-parameters) is not in the text we work from: these are ASSUMED, from measured runs.
-    """
+    """Everything a run is made of.  ASSUMED, from measured runs: Table 3 (hyper-parameters) is not in our text."""
 
     BY = "ppo"  # who goes on with a run
 
@@ -141,11 +137,11 @@ def standardise(x):
     return (x - x.mean()) / (x.std() + 1e-8)
 
 
-def policy_loss(policy: Policy, x, action, logp_old, adv, eps):
+def policy_loss(policy: Policy, x, action, logp_old, adv, eps, also=None):
     r"""Loss of a minibatch and its gradient with respect to all of the policy's parameters.
 
     Equation  −L(θ) of Appendix B, π_θ = N(μ_θ(o), diag σ²)
-    Args      x (B, obs), normalised; action (B, u), unclipped; logp_old, adv (B,)
+    Args      x (B, obs), normalised; action (B, u), unclipped; logp_old, adv (B,); also : of μ, a loss and dμ to add
     Returns   loss : float; gradient (P,) laid out as policy.theta_pi; dict(mu, ratio)
     Test      tests/test_ppo.py::test_policy_loss, tests/test_gradients.py::test_backward
     """
@@ -153,8 +149,9 @@ def policy_loss(policy: Policy, x, action, logp_old, adv, eps):
     logp = gaussian_logp(action, mu, policy.log_std)
     loss, dlogp, ratio = clipped_surrogate(logp, logp_old, adv, eps)
     dmu, dlog_std = gaussian_logp_backward(dlogp, action, mu, policy.log_std)
-    _, dtheta = policy.actor.backward(dmu, cache, want_dx=False)
-    return loss, np.concatenate([dtheta, dlog_std.astype(dtheta.dtype)]), {"mu": mu, "ratio": ratio}
+    more, extra = also(mu) if also else (0.0, 0.0)
+    _, dtheta = policy.actor.backward(dmu + extra, cache, want_dx=False)
+    return loss + more, np.concatenate([dtheta, dlog_std.astype(dtheta.dtype)]), {"mu": mu, "ratio": ratio}
 
 
 def critic_loss(policy: Policy, x, target):
@@ -324,7 +321,7 @@ class Trainer:
         opt, policy, kls, clipped, losses = self.opt, self.policy, [], [], []
         for rows in parts:
             drawn = batch.x[rows, : policy.obs_size], batch.action[rows], batch.logp[rows]
-            loss, grad, out = policy_loss(policy, *drawn, batch.adv[rows], opt.clip_eps)
+            loss, grad, out = policy_loss(policy, *drawn, batch.adv[rows], opt.clip_eps, self.also(batch, rows))
             clip_grad_norm(grad, MAX_GRAD_NORM)
             kls.append(gaussian_kl(batch.mu[rows], batch.old_std, out["mu"], policy.log_std))
             self.adam_pi.step(policy.theta_pi, grad)
@@ -332,6 +329,9 @@ class Trainer:
             clipped.append(float(np.mean(np.abs(out["ratio"] - 1.0) > opt.clip_eps)))
             losses.append(loss)
         return {"kl": fmean(kls), "clip_fraction": fmean(clipped), "policy_loss": fmean(losses)}
+
+    def also(self, batch, rows):
+        """What is added to `policy_loss`: nothing.  extras/teacher.py adds a teacher's pull."""
 
     def fit_critic(self, batch, parts) -> float:
         """One epoch of the value network.  -> mean loss"""
@@ -391,9 +391,7 @@ def run(trainer: Trainer, loaded=None, before=0):
     save = lambda rows: trainer.save(out / runs.CHECKPOINT, meta | {"rows": rows})  # noqa: E731
     progress = runs.Progress(opt.steps, trainer.steps)
     journal = runs.Journal(out, config, opt.resume, rows, progress, save, CHECKPOINT_SECONDS)
-    weights = f"policy {trainer.policy.actor.n_params:,} and critic {trainer.policy.critic.n_params:,} weights"
-    inputs = f"{env.obs_size} observations ({env.critic_size} for the critic), {env.action_size} actions"
-    print(f"{env.name}: {inputs}, {data['sequences']} sequences, {data['minutes']:.1f} min; {weights}")
+    print(f"{env.name}: {trainer.policy.summary()}, {data['sequences']} sequences, {data['minutes']:.1f} min")
     if trainer.steps >= opt.steps:
         print(f"nothing to do: --steps {opt.steps} is the total to reach, and {trainer.steps} are done")
     with journal:

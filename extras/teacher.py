@@ -4,6 +4,7 @@ of single motions, so that one policy does what several learnt  (ours).
     python -m extras.teacher --character jesse --motion FOLDER --init characters/jesse.npz --steps 1500000 --out runs/t
     python ppo.py --character jesse --motion FOLDER --init runs/t --out runs/a               then PPO goes on from it
     python -m extras.teacher --character jesse --motion FOLDER --init characters/jesse.npz --expert 'back_*=runs/b' …
+    python -m extras.teacher --character jesse --motion FOLDER --init characters/jesse.npz --pull 0.02 …    PPO, pulled
 
 Eq. 8's kernel is flat where an arm is far from the user's: with Table 2's k a hanging arm that should be raised earns
 e^-10 of its reward, and a little higher earns no more.  So PPO leaves it hanging, and elbows alone bend.  What an arm
@@ -20,11 +21,17 @@ of their weights does not step backwards (LOG.md, 2026-11-29).  A student that h
 how one falls, and is told there what an expert would do that never gets there: so the expert itself drives `drive` of
 the characters in its sequences, the mixture of [Ross11].
 
+Arms that suddenly do as they are taught throw over legs that never knew such arms.  With `--pull` the student does not
+copy: PPO goes on, and its loss has the teacher's arms beside it ([Schmitt18]), so that the legs learn meanwhile:
+
+    loss = −L(θ) + β mean over samples of Σ over taught motors (μ_i(o) − a*_i)² / (2 σ_i²)
+
 The student sees sensors alone, as ever.  Its normaliser stays as it was; its critic learns what the new actions are
 worth.
 
 [Ross11]  Ross, Gordon and Bagnell, A reduction of imitation learning and structured prediction to no-regret online
           learning, AISTATS 2011
+[Schmitt18]  Schmitt et al., Kickstarting deep reinforcement learning, arXiv 1803.03835, 2018
 """
 
 from __future__ import annotations
@@ -45,7 +52,7 @@ from env import Env
 from extras import train
 from extras.policies import pairs_of
 from nn import clip_grad_norm
-from plumbing.cli import POSITIVE, UNIT, UserError, arg, run_main
+from plumbing.cli import NONNEGATIVE, POSITIVE, UNIT, UserError, arg, run_main
 from plumbing.training import given_names, progress_line, read_options
 from policy import check_fits, load_policy, widths
 
@@ -65,6 +72,7 @@ class Options(train.Options):
     )
     drive: float = arg(0.0, "share of the characters that experts drive, in their sequences", check=UNIT)
     teacher_lr: float = arg(3e-4, "learning rate of the student's copying", check=POSITIVE)
+    pull: float = arg(0.0, "instead of copying, PPO: so much the teacher's arms weigh in its loss", check=NONNEGATIVE)
 
 
 def taught(char: Character, groups) -> np.ndarray:
@@ -211,6 +219,55 @@ class Student(ppo.Trainer):
         return plain | {"taught": f"{stats['taught_rms']:.3f}", "kept": f"{stats['kept_rms']:.3f}"}
 
 
+def pulled(mu, wanted, motors, log_std, weight):
+    r"""The teacher's pull on the means of some motors: a loss and its gradient with respect to all means.
+
+    Equation  β mean over samples of Σ_i (μ_i − a*_i)² / (2 σ_i²), i over motors: −β log π(a*) of those, less what does
+              not depend on μ.  σ is not moved by it
+    Args      mu, wanted (B, u); motors : indices; log_std (u,); weight : β
+    Returns   loss : float; dmu (B, u)
+    Test      tests/extras/test_teacher.py::test_pulled"""
+    error, dmu = mu[:, motors] - wanted[:, motors], np.zeros_like(mu)
+    dmu[:, motors] = weight / len(mu) * error * np.exp(-2.0 * log_std[motors])
+    return 0.5 * float(np.sum(dmu[:, motors] * error)), dmu
+
+
+class Pulled(Student):
+    """PPO as ever, with the teacher's pull on the arms.
+
+    Test      tests/extras/test_teacher.py::test_pulled_student"""
+
+    def __init__(self, opt: Options, env: Env, policy=None):
+        super().__init__(opt, env, policy)
+        self.adam_pi.lr = opt.lr
+
+    def step(self, t):
+        """As PPO's, and what the arms should have done."""
+        self.wanted[t] = self.teacher()
+        ppo.Trainer.step(self, t)
+
+    def samples(self):
+        """PPO's, with the teacher's actions."""
+        batch = super().samples()
+        batch.wanted = self.wanted.reshape(batch.mu.shape)
+        return batch
+
+    def also(self, batch, rows):
+        """The pull on a minibatch's means."""
+        opt, policy = self.opt, self.policy
+        return lambda mu: pulled(mu, batch.wanted[rows], self.arms, policy.log_std, opt.pull)
+
+    def update(self) -> dict:
+        """PPO's update; how far the arms were from the teacher's before it."""
+        error = (self.mu - self.wanted)[..., self.arms]
+        return ppo.Trainer.update(self) | {"taught_rms": float(np.sqrt(np.square(error).mean()))}
+
+    @staticmethod
+    def line(stats) -> dict:
+        """PPO's progress line, and how far the arms are from their teacher, as a share of the torque limits."""
+        return progress_line(stats) | {"taught": f"{stats['taught_rms']:.3f}"}
+
+
 def main(argv=None):
     """python -m extras.teacher: by the character's recipe.  Test: tests/extras/test_teacher.py::test_command"""
     opt = read_options(Options, argv, "extras.teacher", __doc__, widths)
@@ -222,7 +279,9 @@ def main(argv=None):
         raise UserError("--joints: beside --expert no joints are taught: leave out one of the two")
     if opt.drive and not opt.expert:
         raise UserError("--drive: an expert drives: valid with --expert")
-    ppo.train(opt, train.make_env(opt), trainer=Student)
+    if opt.pull and opt.expert:
+        raise UserError("--pull: pulls arms to the teacher's: leave out --expert, or --pull")
+    ppo.train(opt, train.make_env(opt), trainer=Pulled if opt.pull else Student)
 
 
 if __name__ == "__main__":

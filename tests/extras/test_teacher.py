@@ -6,7 +6,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from test_ppo import TINY, assert_same_run
+from scipy.stats import norm
+from test_ppo import TINY, assert_same_run, policy_batch
 
 import ppo
 from env import Env
@@ -120,6 +121,61 @@ def test_student_copies(start, tmp_path):
     train.main([*TINY, "--init", str(tmp_path / "a"), "--out", str(tmp_path / "b"), "--steps", "64"])
 
 
+def test_pulled():
+    """The loss is −β log π(a*) of the taught motors but for a constant, by SciPy; with it the gradient of PPO's loss is
+    its difference quotient, and σ feels PPO alone."""
+    policy, x, action, logp_old, adv, _ = policy_batch()
+    rng, motors, x = np.random.default_rng(4), np.array([0, 2]), x[:, :5]
+    wanted = rng.standard_normal(action.shape)
+    also = lambda mu: teacher.pulled(mu, wanted, motors, policy.log_std, 0.3)  # noqa: E731
+
+    def slow(mu):
+        return -0.3 * norm.logpdf(wanted[:, motors], mu[:, motors], np.exp(policy.log_std)[motors]).sum(1).mean()
+
+    one, two = policy.actor(x), policy.actor(x) + rng.standard_normal(action.shape)
+    assert also(one)[0] - also(two)[0] == pytest.approx(slow(one) - slow(two))
+    assert not also(one)[1][:, 1].any()
+    whole = lambda: ppo.policy_loss(policy, x, action, logp_old, adv, 0.2, also)  # noqa: E731
+    given, theta, plain = whole()[1], policy.theta_pi, ppo.policy_loss(policy, x, action, logp_old, adv, 0.2)
+    for k in rng.choice(policy.actor.n_params, 30, replace=False):
+        was, found = theta[k], []
+        for h in (1e-6, -1e-6):
+            theta[k] = was + h
+            found.append(whole()[0])
+        theta[k] = was
+        assert given[k] == pytest.approx((found[0] - found[1]) / 2e-6, rel=1e-5, abs=1e-8)
+    np.testing.assert_array_equal(given[-3:], plain[1][-3:])
+    assert whole()[0] == pytest.approx(plain[0] + also(one)[0])
+
+
+def test_pulled_student(start, tmp_path):
+    """Arms come nearer to the teacher while PPO goes on; without a pull they do not.  Two and two updates are four."""
+    found = []
+    for name, pull in (("a", "3"), ("b", "1e-9")):
+        run(
+            tmp_path / name,
+            40,
+            "--init",
+            str(start),
+            "--lr",
+            "0.001",
+            "--epochs",
+            "4",
+            "--target-kl",
+            "0.2",
+            "--pull",
+            pull,
+        )
+        rows = [row.split(",") for row in (tmp_path / name / "metrics.csv").read_text().splitlines()]
+        taught = np.array([float(r[rows[0].index("taught_rms")]) for r in rows[1:]])
+        found.append(taught[-10:].mean() / taught[:3].mean())
+    assert found[0] < 0.9 and found[1] > 1.0
+    run(tmp_path / "whole", 4, "--init", str(start), "--pull", "1")
+    run(tmp_path / "c", 2, "--init", str(start), "--pull", "1")
+    run(tmp_path / "c", 4, "--resume")
+    assert_same_run(tmp_path / "whole", tmp_path / "c")
+
+
 def test_experts(start, tmp_path):
     """Each sequence is the first expert's whose pattern fits its name, or nobody's; what fits nothing is refused."""
     opt = teacher.Options(init=str(start), clips="*", envs=4, horizon=4, threads=1)
@@ -197,6 +253,10 @@ def test_command(start, tmp_path, capsys):
         (["--gpu"], "--gpu: a student copies on the processor"),
         (["--expert", "*=x.npz", "--joints", "tail"], "--joints: beside --expert no joints are taught"),
         (["--drive", "0.5"], "--drive: an expert drives: valid with --expert"),
+        (
+            ["--pull", "0.1", "--expert", "*=x.npz"],
+            "--pull: pulls arms to the teacher's: leave out --expert, or --pull",
+        ),
     ):
         with pytest.raises(SystemExit):
             run_main(teacher.main, [*TINY, "--init", str(start), *flags, "--out", str(tmp_path / "a")])
