@@ -6,6 +6,7 @@ r"""Other users through the whole pipeline, and how a character fails under them
     python -m extras.users --motion FOLDER --by crossing       legs under another's trunk: §6's uncorrelated motion
     python -m extras.users --motion FOLDER --by head           held otherwise, or a headset that sits so; looking around
     python -m extras.users --motion FOLDER --by push           the character is pushed: §6's unbalancing
+    python -m extras.users --motion FOLDER --by time           how far from its user, and when: §6's compounding errors
 
     clips ──► of_build, warp, tilted, … ──► recorded headset, calibrated ──► ride ──► completed, falls, losses, errors
               joints                        by its first second              streamed, from the default pose
@@ -27,10 +28,10 @@ import numpy as np
 
 import metrics
 from character import Character
-from headset.player import Player, ride, stream_of, tally
+from headset.player import Player, from_user, ride, stream_of, tally
 from human import SEG, SENSOR_OFFSETS, headset_height, quat_about, quat_conj, quat_mul, quat_rotate
 from mocap.augment import looking, resize, warp
-from mocap.data import parts
+from mocap.data import CONTROL_RATE, parts, stitched
 from play import slides_of
 from plumbing.cli import THREADS, UserError, arg, cell, cli, given_flags, markdown, run_main
 from plumbing.files import atomic_write, check_folders
@@ -61,7 +62,9 @@ class Options(metrics.MotionFlags):
         ("jesse", "oppy", "dino"), "names or .toml paths, the .npz beside it", check=(len, "one or more names")
     )
     heights: tuple[float, ...] = arg((1.45, 1.6, MIDDLE, 1.9, 2.0), "statures of the users [m]", check=STATURES)
-    by: str = arg("height", "what the users differ by", choices=("height", "pace", "crossing", "head", "push", "none"))
+    by: str = arg(
+        "height", "what the users differ by", choices=("height", "pace", "crossing", "head", "push", "time", "none")
+    )
     split: str = arg("validation", "which part", choices=("train", "validation", "style", "body"))
     half: str = arg("report", "which captures, as metrics.py: select, report, both", choices=tuple(metrics.HALVES))
     json: str | None = arg(None, "write the table here")
@@ -112,6 +115,8 @@ def users(opt: Options) -> dict:
     recorded = {"as recorded": list}
     if opt.by in ("none", "push"):
         return recorded
+    if opt.by == "time":
+        return {"stitched": lambda clips: stitched(clips, opt.motion, verbose=False)}
     if opt.by == "crossing":  # ASSUMED: the other is half the captures on, of another kind where they are in order
         return recorded | {"crossed": lambda clips: list(map(crossed, clips, clips[len(clips) // 2 :] + clips))}
     if opt.by == "pace":
@@ -173,6 +178,40 @@ def row_of_streams(char: Character, act, streams, devices, threads, push=None) -
     }
 
 
+SINCE = {"0–1 s": (0, 1), "1–2 s": (1, 2), "2–5 s": (2, 5), "5–10 s": (5, 10), "10–20 s": (10, 20)}  # of play
+BEFORE = (2.0, 1.0, 0.5, 0.2)  # s before a failure
+
+
+def by_time(char: Character, act, clips, devices, threads) -> dict:
+    """Horizontal distance from the user's headset [cm] (`headset.player.from_user`): by the time since the start, of
+    captures that last for 20 s without a failure, and by the time before a failure, of lives of more than 3 s.
+
+    Test      tests/extras/test_users.py::test_by_time"""
+    streams = [stream_of(char, clip, devices)[:2] for clip in clips]
+    rides = ride(char, act, streams, devices, threads)
+    far = [100 * from_user(r.qpos, pos[:, 0]) for r, (pos, _) in zip(rides, streams, strict=True)]
+    return times_of(rides, far)
+
+
+def times_of(rides, far) -> dict:
+    """The row of `by_time`, from the distances of every tick of every ride.
+
+    Test      tests/extras/test_users.py::test_by_time"""
+    rate, long = round(CONTROL_RATE), max(end for _, end in SINCE.values())
+    whole = [f for r, f in zip(rides, far, strict=True) if r.first >= long * rate]
+    lost = [f[a:b] for r, f in zip(rides, far, strict=True) for a, b in r.lives[:-1] if b - a > 3.0 * rate]
+    mean = lambda values: float(np.mean(values)) if len(values) else float("nan")  # noqa: E731
+    return {
+        "captures": len(rides),
+        "without failure": len(whole),
+        **{title: mean([f[a * rate : b * rate].mean() for f in whole]) for title, (a, b) in SINCE.items()},
+        "failures": len(lost),
+        **{f"{t:g} s before": mean([f[-round(t * rate)] for f in lost]) for t in BEFORE},
+    }
+
+
+TIMES = {"captures": "{:d}", "without failure": "{:d}", **dict.fromkeys(SINCE, "{:.1f}"), "failures": "{:d}"}
+TIMES |= {f"{t:g} s before": "{:.1f}" for t in BEFORE}
 COLUMNS = {
     "captures": "{:d}",
     "completed": "{:.2f}",
@@ -198,16 +237,17 @@ def main(argv=None):
     check_folders(opt.json, read=(*parts(opt.motion), *(path for _, path, _ in policies)))
     asked = {f.name: getattr(opt, f.name) for f in fields(metrics.MotionFlags)}
     captures = metrics.captures_of(metrics.Options(**asked, split=opt.split, half=opt.half))
-    print(markdown([["", *(k.replace("_", " ") for k in COLUMNS)]]), flush=True)
-    out = {}
+    columns, out = TIMES if opt.by == "time" else COLUMNS, {}
+    print(markdown([["", *(k.replace("_", " ") for k in columns)]]), flush=True)
     for name, (policy, path, meta) in zip(opt.characters, policies, strict=True):
         own = metrics.Options(character=name)
         char, devices = load_character(own, meta, path), devices_of(meta, path, None)
         check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
         for (user, played_by), (pushed, push) in product(users(opt).items(), pushes(char, opt).items()):
-            row = row_of(char, policy.mean_action, played_by(captures), devices, opt.threads, push)
+            how = char, policy.mean_action, played_by(captures), devices, opt.threads
+            row = by_time(*how) if opt.by == "time" else row_of(*how, push)
             out[title := f"{metrics.name_of(char)}: {user}{pushed}"] = row
-            print("| " + " | ".join([title, *(cell(row[k], f) for k, f in COLUMNS.items())]) + " |", flush=True)
+            print("| " + " | ".join([title, *(cell(row[k], f) for k, f in columns.items())]) + " |", flush=True)
     if opt.json:
         atomic_write(opt.json, metrics.as_json(out))
 

@@ -42,6 +42,15 @@ AWAY = 1.0  # m, horizontally from the user's headset to HEADSET_AHEAD before th
 # Its own headset would charge it with its build (Dino's is 0.24 m farther ahead): `Ride.farthest` has that distance
 
 
+def from_user(qpos, headset) -> np.ndarray:
+    """Horizontally from HEADSET_AHEAD before the root, where training has it, to the user's headset [m].
+
+    Args      qpos (N, nq); headset (N, 3), world.  Returns (N,)
+    Test      tests/extras/test_users.py::test_by_time"""
+    place = qpos[:, :2] + quat_rotate(quat_about(2, heading(qpos[:, 3:7])), HEADSET_AHEAD)[:, :2]
+    return np.linalg.norm(place - headset[:, :2], axis=1)
+
+
 class Player:
     """N characters, each driven by sensor poses of its own; there is no human to compare with.
 
@@ -135,8 +144,7 @@ class Player:
         bad |= (self.batch.warning[:, BAD, 1] > 0).any(axis=1)
         with np.errstate(invalid="ignore"):
             fall = fallen(geom_lowest(m, self.char.fall_geoms, self.geom_xpos, self.geom_xmat).min(axis=1))
-            under = self.qpos[:, :2] + quat_rotate(quat_about(2, heading(self.qpos[:, 3:7])), HEADSET_AHEAD)[:, :2]
-            away = np.linalg.norm(under - pos[:, 0, :2], axis=1) > AWAY
+            away = from_user(self.qpos, pos[:, 0]) > AWAY
         return ["bad" if b else "fall" if f else "away" if a else None for b, f, a in zip(bad, fall, away)]
 
     @property

@@ -1,6 +1,7 @@
 """extras/users.py: builds, the rows of the table, and one row against `metrics.streamed`."""
 
 import json
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import character
 import metrics
 from extras import users
-from headset.player import ride, stream_of
+from headset.player import AWAY, Ride, from_user, ride, stream_of
 from human import SEG, headset_height, sensors
 from mocap import data
 from mocap.augment import looking
@@ -50,6 +51,7 @@ def test_rows(clip):
     ]  # fmt: skip
     assert [round(users.stature(f([clip])[0]), 6) for f in rows.values()] == [1.5] * 2 + [1.75] * 4
     [(_, same)] = users.users(users.Options(by="none")).items()
+    assert users.users(users.Options(by="time"))["stitched"]([clip]) == [clip]
     assert same([clip]) == [clip]
     paces = users.users(users.Options(by="pace"))
     lengths = [len(f([clip])[0]) for f in paces.values()]
@@ -133,6 +135,35 @@ def test_row(clip):
     for key in ("completed", "survival", "fails_every_s", "first_failure_s", "own_slide_cm_s"):
         assert row[key] == pytest.approx(other[key]), key
     assert row["captures"] == 1 and row["head_cm"] > 5
+
+
+def test_by_time(clip):
+    """The distance from a user who goes 0.2 m/s faster, by hand; a start under the headset, and what a limp one does."""
+    seconds = np.arange(600) / data.CONTROL_RATE
+
+    def ridden(ticks, *cuts):
+        anew, empty = np.zeros(ticks, bool), np.zeros((ticks, 1))
+        anew[[0, *cuts]] = True
+        return Ride(empty, empty, empty, anew, Counter(fall=len(cuts)), 0.0, 0.0, 0.0)
+
+    row = users.times_of([ridden(600), ridden(600, 150, 180), ridden(599)], [20 * seconds, 10 * seconds, seconds])
+    assert (row["captures"], row["without failure"], row["failures"]) == (3, 1, 1)  # one life too short, one ride, too
+    since = [20 * (np.arange(a * 30, b * 30) / 30).mean() for a, b in users.SINCE.values()]
+    before = [10 * (5.0 - t) for t in users.BEFORE]
+    asked = dict(zip([*users.SINCE, *(f"{t:g} s before" for t in users.BEFORE)], since + before, strict=True))
+    assert {k: row[k] for k in asked} == pytest.approx(asked)
+
+    char, limp = character.load("oppy"), lambda obs: np.zeros((len(obs), len(char.limits)))
+    stream = stream_of(char, clip)[:2]
+    [one] = ride(char, limp, [stream])
+    far = from_user(one.qpos, stream[0][:, 0])
+    assert far[0] == pytest.approx(0.0, abs=1e-3) and far[1:].max() <= AWAY + 0.1  # one step more
+    turn = Rotation.from_euler("z", 0.7)
+    moved = one.qpos.copy()
+    moved[:, :3] = turn.apply(moved[:, :3])
+    moved[:, 3:7] = (turn * Rotation.from_quat(moved[:, 3:7], scalar_first=True)).as_quat(scalar_first=True)
+    np.testing.assert_allclose(from_user(moved, turn.apply(stream[0][:, 0])), far, atol=1e-5)
+    assert users.by_time(char, limp, [clip], 3, 1)["without failure"] == 0
 
 
 def test_command(clip, tmp_path, monkeypatch, capsys):
