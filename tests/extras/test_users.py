@@ -138,7 +138,7 @@ def test_row(clip):
 
 
 def test_by_time(clip):
-    """The distance from a user who goes 0.2 m/s faster, by hand; a start under the headset, and what a limp one does."""
+    """The distance from a user who goes 0.2 m/s faster, by hand; a start under the headset, and a limp one."""
     seconds = np.arange(600) / data.CONTROL_RATE
 
     def ridden(ticks, *cuts):
