@@ -58,9 +58,9 @@ OF_TABLE = {"half", "rows", "random_starts"}  # of --measure and --compare alone
 OF_STREAM = {"axes", "grip", "stream_unit", "devices", "sample_rate", "user_height", "realtime"}
 
 FIGURES = {  # of the paper: the policies in characters/ that it puts side by side
-    5: ("oppy-small", "oppy", "oppy-tall"),  # sizes
-    6: ("dino", "dino-orientation"),  # with the orientation reward, and without it
-    8: ("dino", "dino-passive", "dino-fixed"),  # the tail: two joints driven, none driven, six welded
+    5: ("oppy-small", "oppy-same", "oppy-tall"),  # sizes
+    6: ("dino-driven", "dino-orientation"),  # with the orientation reward, and without it
+    8: ("dino-driven", "dino-passive", "dino-fixed"),  # the tail: two joints driven, none driven, six welded
 }
 OF_FIGURE = {"completed", "survival", "root_cm", "head_deg", "head_wobble_deg_s", "contact_agreement"}
 OF_FIGURE |= {"foot_slide_cm_s", "steps_per_m"}
@@ -766,12 +766,14 @@ def look(char: Character, policy, path, meta, opt: Options) -> None:
     check_fits(policy, Env(char, seen, 1), path)
     if opt.png or opt.video or opt.bvh:
         told = max(1, round(opt.seconds * CONTROL_RATE)) if opt.seconds else None
-        last = told or (round(10.0 * CONTROL_RATE) if opt.png or opt.video else EPISODE_STEPS)
-        shown = min(last, EPISODE_STEPS, len(ref) - 1) / CONTROL_RATE
+        whole = max(len(ref) - 1, 1)
+        last = min(told or (round(10.0 * CONTROL_RATE) if opt.png or opt.video else whole), whole)
+        shown = last / CONTROL_RATE
         if push and push.at >= shown:
             says = f"only {shown:.1f} s are shown: push earlier, or give more --seconds"
             raise UserError(f"--push {opt.push}: {says}")
-        recording = simulate(char, seen, policy_action(policy), threads=opt.threads, push=push)[0]
+        horizon = whole if opt.bvh and not told else last
+        recording = simulate(char, seen, policy_action(policy), horizon, opt.threads, push=push)[0]
         lived = (len(recording.frames) - 1) / CONTROL_RATE
         print(
             told_life(ref.names[0], recording)

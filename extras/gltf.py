@@ -21,7 +21,7 @@ import numpy as np
 import mocap.data
 import play
 from character import Character, Switches
-from env import EPISODE_STEPS, SENSORS, Env
+from env import SENSORS, Env
 from human import quat_conj, quat_continuous, quat_mul, quat_rotate
 from metrics import TIMES, policy_action, shown_to, simulate
 from mocap.data import CONTROL_RATE, MotionFlags
@@ -316,8 +316,8 @@ def recorded(char: Character, policy, path, meta, opt: Options):
     ref = play.sequence_of(char, opt)
     seen = shown_to(meta, path, ref, opt.sensors)
     check_fits(policy, Env(char, seen, 1), path)
-    recording = simulate(char, seen, policy_action(policy), threads=opt.threads)[0]
-    last = round(opt.seconds * CONTROL_RATE) if opt.seconds else EPISODE_STEPS
+    last = min(round(opt.seconds * CONTROL_RATE) if opt.seconds else len(ref), len(ref) - 1)
+    recording = simulate(char, seen, policy_action(policy), max(last, 1), opt.threads)[0]
     print(play.told_life(ref.names[0], recording))
     return recording.qpos[: last + 1]
 

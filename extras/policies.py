@@ -7,8 +7,9 @@ r"""Policies made of policies: shipped, averaged, joined, carried over to anothe
     python -m extras.policies carry OLD.npz NEW.npz --character dino   to go on with as another character, another
                                                                        variation, with other sensors or wider layers
 
-`carry` keeps what both have names for, and what an action did: where the limit or the spring of a joint has changed,
-the same torque is asked for.  `ppo.py --init NEW.npz` then goes on from it, as from what `join` made.
+Each has flags of its own: `python -m extras.policies join --help`.  `carry` keeps what both have names for, and what an
+action did: where the limit or the spring of a joint has changed, the same torque is asked for.  `ppo.py --init NEW.npz`
+then goes on from it, as from what `join` made.
 
 [Wortsman22]  Wortsman et al., Model soups: averaging weights of multiple fine-tuned models, ICML 2022
 """
@@ -248,6 +249,11 @@ def joined(one: Policy, other: Policy, inputs, own) -> Policy:
     return out
 
 
+def unled(path, lead) -> str:
+    """The command that takes a lead back, exactly (`led`)."""
+    return f"python -m extras.policies ship {path} NEW.npz --lead {-lead:g}"
+
+
 def join(out_path, one_path, other_path, motors) -> dict:
     """Write one network of two policies of a character (`joined`).  -> what its file says
 
@@ -260,15 +266,16 @@ def join(out_path, one_path, other_path, motors) -> dict:
     bodies = _body(meta, one_path), _body(its, other_path)
     if not all(bodies) or bodies[0] != bodies[1]:
         raise UserError(f"{other_path}: of the body {bodies[1]}; valid: as {one_path}, {bodies[0]}")
-    for path, m in ((one_path, meta), (other_path, its)):
-        if lead := m.get("lead"):  # PPO that goes on unlearns it
-            undo = f"ship {path} NEW.npz --lead {-lead:g}"
-            raise UserError(f"{path}: is shown its user {lead:g} s ahead; valid: without, as by {undo}")
     char = trained_as(meta, one_path).load()
     names = [char.hinges[h] for h in char.driven]
-    own = np.array([any(fnmatch(name, pattern) for pattern in motors) for name in names])
-    if own.all() or not own.any():
-        raise UserError(f"--motors {','.join(motors)}: {own.sum()} of the motors; valid: some of {', '.join(names)}")
+    fits = np.array([[fnmatch(name, pattern) for name in names] for pattern in motors]).reshape(-1, len(names))
+    own = fits.any(axis=0)
+    if own.all() or not own.any() or not fits.any(axis=1).all():
+        odd = next((m for m, f in zip(motors, fits) if not f.any()), ",".join(motors))
+        raise UserError(f"--motors {odd}: {'all' if own.all() else 'none'}; valid: some of {', '.join(names)}")
+    for path, m in ((one_path, meta), (other_path, its)):
+        if lead := m.get("lead"):  # PPO that goes on unlearns it
+            raise UserError(f"{path}: is shown its user {lead:g} s ahead; valid: without, as by {unled(path, lead)}")
     have, need = (input_names(char, devices_of(m, p, None), False) for m, p in ((meta, one_path), (its, other_path)))
     if lacking := [n for n in need if n not in have]:
         raise UserError(f"{other_path}: sees {lacking[0]}, which {one_path} does not; valid: in the other order")
@@ -409,8 +416,10 @@ def with_limits(policy: Policy, old: Character, new: Character) -> Policy:
 def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, dict]:
     """A policy as that of another body, and what its file says.
 
-    What only one of the two has a name for is silent.  Another character's policy keeps its actions, whatever they are
-    in newton metres, because its mass is another; its normaliser and σ begin anew, because its sizes are others.
+    What only one of the two has a name for is silent.  A lead (`led`) is taken back where devices or the character
+    change, for what it added to the headset's weights was of all devices and of that normaliser.  Another character's
+    policy keeps its actions, whatever they are in newton metres, because its mass is another; its normaliser and σ
+    begin anew, because its sizes are others.
     Args      old, new : characters; opt.sensors, opt.without, opt.hidden, opt.value_hidden : of the new one
     Raises    UserError: it does not fit old; it knows the headset alone and the new one has controllers
     Test      tests/extras/test_policies.py::test_headset_only, test_another_character, test_a_variation
@@ -429,6 +438,9 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
         sizes = f"has {policy.critic_size} inputs and {policy.action_size} actions"
         body = f"{old.path} has {len(have)} and {len(outputs)}"
         raise UserError(f"{path}: {sizes}, {body}: give the body it was trained with as --from-character PATH")
+    if (lead := meta.get("lead")) and (sensors != trained or old.name != new.name):
+        policy, meta = led(policy, old, -lead, ways[0][1]), {k: v for k, v in meta.items() if k != "lead"}
+        print(f"{path}: was shown its user {lead:g} s ahead; no longer: ship --lead does it again")
     place = lambda names, name: names.index(name) if name in names else -1  # noqa: E731
     inputs, motors = [place(have, n) for n in need], [place(outputs, n) for n in wanted]
     actor = sum(observation_terms(new, ways[1][1], sees)["actor"].values())
@@ -456,12 +468,18 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
 
 
 @dataclass
-class Blend:
-    """What `ship` and `blend` can be told."""
+class Ship:
+    """What `ship` can be told."""
 
-    share: float = arg(0.5, "of the others together in the average", check=UNIT)
     gain: float = arg(1.0, "makes the policy's standardised observations so many times as large", check=POSITIVE)
     lead: float = arg(0.0, "shows the policy its user so many seconds ahead, by the headset's velocity", check=LEADS)
+
+
+@dataclass
+class Blend(Ship):
+    """What `blend` can be told."""
+
+    share: float = arg(0.5, "of the others together in the average", check=UNIT)
 
 
 @dataclass
@@ -509,6 +527,8 @@ def check_new(out) -> None:
     """UserError: a policy is there already.  `blend` and `join` name OUT first: a slip of order would cost a policy.
 
     Test      tests/extras/test_policies.py::test_nothing_is_overwritten"""
+    if Path(out).suffix != ".npz":
+        raise UserError(f"{out}: valid: a name that ends in .npz")
     if Path(out).exists():
         raise UserError(f"{out} exists already: valid: the name of a new file (of blend and join it stands first)")
 
@@ -542,14 +562,16 @@ def main(argv=None):
         meta = join(*files, opt.motors)
         print(f"{files[0]}: {', '.join(opt.motors)} of {files[1]}, the rest of {files[2]}; {meta['licence']}")
         return
-    opt = cli(Blend, flags, f"extras.policies {what or 'ship|blend|join|carry'} FILE …", __doc__)
-    if what == "ship" and "share" in given_flags(flags):
-        raise UserError("--share is of blend OUT.npz A B …: leave it out")
+    if what == "blend":
+        opt = cli(Blend, flags, "extras.policies blend OUT.npz A B …", __doc__)
+    else:
+        opt = cli(Ship, flags, "extras.policies ship RUN OUT.npz" if what else "extras.policies ship|blend|…", __doc__)
     run, out, *others = files if what == "ship" else [files[1], files[0], *files[2:]]
     check_folders(out, read=[run, *others])
     check_new(out)
-    meta = ship(run, out, others, opt.share, opt.gain, opt.lead)
-    mixed = f", {1 - opt.share:g} of it and {opt.share:g} of {', '.join(others)}" if others else ""
+    share = opt.share if others else 0.5
+    meta = ship(run, out, others, share, opt.gain, opt.lead)
+    mixed = f", {1 - share:g} of it and {share:g} of {', '.join(others)}" if others else ""
     print(f"{out}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}{mixed}; {meta['licence']}")
 
 

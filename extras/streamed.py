@@ -88,8 +88,9 @@ def captures_of(one: Set, folder: Path, half: str) -> list:
     """A set's captures of that half; [] if its folder is not there.
 
     Test      tests/extras/test_streamed.py::test_captures"""
-    motion = one.folder if one.folder in mocap.data.BUILTIN else str(folder / one.folder)
-    if motion != one.folder and not os.path.isdir(motion):
+    built_in = one.folder in mocap.data.BUILTIN
+    motion = one.folder if built_in else str(folder / one.folder)
+    if not built_in and not os.path.isdir(motion):
         return []
     half = "both" if one.whole and half == "report" else half
     how = dict(all=True) if one.split == "all" else dict(split=one.split)

@@ -26,8 +26,8 @@ copy: PPO goes on, and its loss has the teacher's arms beside it ([Schmitt18]), 
 
     loss = −L(θ) + β mean over samples of Σ over taught motors (μ_i(o) − a*_i)² / (2 σ_i²)
 
-The student sees sensors alone, as ever.  Its normaliser stays as it was; its critic learns what the new actions are
-worth.
+The student sees sensors alone, as ever.  Its normaliser stays as it was, but for `--pull`; its critic learns what the
+new actions are worth.
 
 [Ross11]  Ross, Gordon and Bagnell, A reduction of imitation learning and structured prediction to no-regret online
           learning, AISTATS 2011
@@ -76,10 +76,12 @@ class Options(train.Options):
 
 
 def taught(char: Character, groups) -> np.ndarray:
-    """The motors of groups of joints.  UserError: a group that the character has not
+    """The motors of groups of joints.  UserError: none, or a group that the character has not
 
     Test      tests/extras/test_teacher.py::test_taught"""
     motors = driven_groups(char)
+    if not groups:
+        raise UserError(f"--joints: none; valid: {', '.join(motors)}")
     if odd := set(groups) - set(motors):
         raise UserError(f"--joints {','.join(sorted(odd))}: valid: {', '.join(motors)}")
     return np.array(sorted({motor for group in groups for motor in motors[group].tolist()}), int)
@@ -155,10 +157,10 @@ class Student(ppo.Trainer):
 
     def __init__(self, opt: Options, env: Env, policy=None):
         super().__init__(opt, env, policy)
-        self.old, _ = load_policy(opt.init)
+        self.old = None if opt.pull else load_policy(opt.init)[0]
         self.experts, self.whose = experts(opt.expert, env)
-        self.arms = taught(env.char, () if opt.expert else opt.joints)
-        self.teacher = Teacher(env) if len(self.arms) else None
+        self.arms = np.array([], int) if opt.expert else taught(env.char, opt.joints)
+        self.teacher = None if opt.expert else Teacher(env)
         self.driven = np.arange(env.n) < opt.drive * env.n
         self.wanted, self.by_teacher = np.zeros_like(self.mu), np.zeros(self.mu.shape, bool)
         self.adam_pi.lr = opt.teacher_lr
@@ -281,6 +283,8 @@ def main(argv=None):
         raise UserError("--drive: an expert drives: valid with --expert")
     if opt.pull and opt.expert:
         raise UserError("--pull: pulls arms to the teacher's: leave out --expert, or --pull")
+    if opt.pull and "teacher_lr" in given_names(argv):
+        raise UserError("--teacher-lr: is of copying: beside --pull the learning rate is --lr")
     ppo.train(opt, train.make_env(opt), trainer=Pulled if opt.pull else Student)
 
 

@@ -51,7 +51,7 @@ PLAYERS_STAND = 1.5  # ASSUMED: s at a recording's beginning in which a player s
 AIDED = 10.0  # s between failures, ASSUMED: sequences that do as well are not aided
 REACHED = 0.5  # s, ASSUMED: in which the hand that aids would have the root at its target
 PUSH_SECONDS = 2.0  # mean time between pushes
-CODE = 6  # counts up when retargeting or augmenting changes what it makes: older caches are then made anew
+CODE = 7  # counts up when retargeting or augmenting changes what it makes: older caches are then made anew
 CHUNK = 100  # clips retargeted between two lines of progress
 
 

@@ -179,12 +179,12 @@ def row_of_streams(char: Character, act, streams, devices, threads, push=None) -
 
 
 SINCE = {"0–1 s": (0, 1), "1–2 s": (1, 2), "2–5 s": (2, 5), "5–10 s": (5, 10), "10–20 s": (10, 20)}  # of play
-BEFORE = (2.0, 1.0, 0.5, 0.2)  # s before a failure
+BEFORE, LIVED = (2.0, 1.0, 0.5, 0.2), 3.0  # s before a failure, of those that had lived for so many
 
 
 def by_time(char: Character, act, clips, devices, threads) -> dict:
     """Horizontal distance from the user's headset [cm] (`headset.player.from_user`): by the time since the start, of
-    captures that last for 20 s without a failure, and by the time before a failure, of lives of more than 3 s.
+    captures of 20 s or more without a failure, and by the time before a failure, of what had lived for 3 s by then.
 
     Test      tests/extras/test_users.py::test_by_time"""
     streams = [stream_of(char, clip, devices)[:2] for clip in clips]
@@ -198,20 +198,22 @@ def times_of(rides, far) -> dict:
 
     Test      tests/extras/test_users.py::test_by_time"""
     rate, long = round(CONTROL_RATE), max(end for _, end in SINCE.values())
-    whole = [f for r, f in zip(rides, far, strict=True) if r.first >= long * rate]
-    lost = [f[a:b] for r, f in zip(rides, far, strict=True) for a, b in r.lives[:-1] if b - a > 3.0 * rate]
+    both = list(zip(rides, far, strict=True))
+    whole = [f for r, f in both if not r.failures and len(r.qpos) >= long * rate]
+    lives = [f[a:b] for r, f in both for a, b in r.lives[: r.failures]]  # the last is no failure's, if there is one
+    lost = [f for f in lives if len(f) > LIVED * rate]
     mean = lambda values: float(np.mean(values)) if len(values) else float("nan")  # noqa: E731
     return {
         "captures": len(rides),
         "without failure": len(whole),
         **{title: mean([f[a * rate : b * rate].mean() for f in whole]) for title, (a, b) in SINCE.items()},
-        "failures": len(lost),
+        f"failures after {LIVED:g} s": len(lost),
         **{f"{t:g} s before": mean([f[-round(t * rate)] for f in lost]) for t in BEFORE},
     }
 
 
-TIMES = {"captures": "{:d}", "without failure": "{:d}", **dict.fromkeys(SINCE, "{:.1f}"), "failures": "{:d}"}
-TIMES |= {f"{t:g} s before": "{:.1f}" for t in BEFORE}
+TIMES = {"captures": "{:d}", "without failure": "{:d}", **dict.fromkeys(SINCE, "{:.1f}")}
+TIMES |= {f"failures after {LIVED:g} s": "{:d}"} | {f"{t:g} s before": "{:.1f}" for t in BEFORE}
 COLUMNS = {
     "captures": "{:d}",
     "completed": "{:.2f}",

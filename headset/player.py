@@ -198,8 +198,8 @@ class Ride:
 
     @property
     def first(self):
-        """Ticks before the first failure; all of them without one."""
-        return self.lives[0][1] if self.failures else len(self.qpos)
+        """Steps before the first that failed; all of them without one."""
+        return self.lives[0][1] - 1 if self.failures else len(self.qpos)
 
     @property
     def lives(self) -> list[tuple[int, int]]:

@@ -330,12 +330,34 @@ def read(path, reading=AS_IT_IS, quiet=False) -> bvh.Bvh:
     except OSError as e:
         raise UserError(f"{path}: {e.strerror or e}; expected a regular .bvh file") from None
     _check_moving(path, len(b.names), b.values.shape[1])
+    if not reading.rate and (slower := cmu_rate(path, 1.0 / b.frame_time)):
+        if not quiet:
+            say(path, _twice(1.0 / b.frame_time))
+        b = replace(b, frame_time=1.0 / slower)
     if reading.rest_pose == "keep" or not may_rest(b.values):
         return b
     n = leading_rest(bvh.global_pose(replace(b, values=b.values[:REST_SEEN]))[0])
     if n and not quiet:
         say(path, _dropped(n))
     return replace(b, values=b.values[n:])
+
+
+CMU_60 = re.compile(r"6[01]_(salsa_)?\d\d")  # file names of CMU's subjects 60 and 61, who dance salsa
+
+
+def cmu_rate(path, rate) -> float | None:
+    """Half the rate, for captures of CMU that were recorded at 60 Hz and are said to be of 120; None for others.
+
+    ASSUMED   subjects 60 and 61: as 120 Hz (30 in every fourth frame) eight beats of their salsa last 1.45 s, 331 a
+              minute, and her pelvis turns at 20 rad/s; at half that 165, which is salsa's.  Some subjects of CMU's are
+              of 60 Hz, and conversions that know one rate play them at twice their pace
+    Test      tests/mocap/test_amc.py::test_cmu_rate"""
+    return rate / 2.0 if CMU_60.fullmatch(Path(path).stem) and round(rate) in (30, 120) else None
+
+
+def _twice(rate) -> str:
+    half = f"read at {rate / 2:.3g} frames a second; as it was: --rate {rate:.3g}"
+    return f"CMU recorded this dance at 60 Hz, and {rate:.3g} frames a second are those of 120: {half}"
 
 
 def _dropped(n) -> str:
@@ -567,7 +589,10 @@ def from_amc(path, reading=AS_IT_IS) -> Clip:
         raise UserError(f"{s.path}: the axes of its bones make no frame: {e}; expected CMU's bones") from None
     calibrations = np.stack([rig.calibration(segment) for segment in SEGMENTS])
     pose = amc.global_pose(s, motion)
-    clip = human_clip(rig, calibrations, s.names, *pose, Path(path).stem, "", reading.rate or AMC_RATE)
+    slower = None if reading.rate else cmu_rate(path, AMC_RATE)
+    if slower:
+        say(path, _twice(AMC_RATE))
+    clip = human_clip(rig, calibrations, s.names, *pose, Path(path).stem, "", reading.rate or slower or AMC_RATE)
     n = leading_rest(clip.pos) if reading.rest_pose != "keep" else 0
     if n:
         say(path, _dropped(n))

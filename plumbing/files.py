@@ -327,7 +327,7 @@ def read_arrays(path, expected) -> dict:
     except zipfile.BadZipFile:
         with open(path, "rb") as file:
             start = file.read(2)
-        damage = "cut short or damaged" if start == b"PK" else "no .npz" if start else "empty"
+        damage = "cut short or damaged" if start == b"PK" else "not a zip archive, as .npz is" if start else "empty"
     except UNREADABLE as error:
         damage = f"{type(error).__name__}: {error}"
     raise UserError(f"cannot read checkpoint {path} ({damage}): {expected}")

@@ -18,6 +18,7 @@ from plumbing.cli import UserError, cli, given_flags
 from plumbing.runs import CONFIG, check_run, read_config, stored_options
 
 CHANGEABLE = ("steps", "threads", "resume", "out", "address")  # what may differ when a run is resumed
+TOGETHER = {"extras.train", "extras.cluster"}  # go on with one another's runs
 
 
 def read_options(kind, argv, prog, description, widths=None):
@@ -62,6 +63,9 @@ def resumed_options(opt, argv, changeable=CHANGEABLE):
               tests/skeletal/test_skeletal_play.py::test_autoencode_command, test_train_command
     """
     check_run(opt.out, resume=True)
+    by, own = read_config(opt.out)["config"].get("by"), getattr(type(opt), "BY", None)
+    if by and own and by != own and {by, own} - TOGETHER:  # before anything is written
+        raise UserError(f"{opt.out}: was trained by {by}; valid: python ppo.py --resume --out {opt.out}, or -m {by}")
     stored, given, values = stored_options(type(opt), opt.out), given_names(argv), {}
     for f in dataclasses.fields(opt):
         asked = getattr(opt, f.name)

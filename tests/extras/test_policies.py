@@ -146,8 +146,10 @@ def test_blended(tmp_path):
         policies.ship(paths[1], tmp_path / "c.npz", [tmp_path / "odd.npz"])
     save_checkpoint(tmp_path / "less.npz", arrays, meta | {"options": meta["options"] | {"set": "reward.q=[0, 1]"}})
     policies.ship(paths[1], tmp_path / "d.npz", [tmp_path / "less.npz"])  # another reward is the same body
-    with pytest.raises(UserError, match="--share is of blend"):
+    with pytest.raises(SystemExit):
         policies.main(["ship", str(paths[0]), str(tmp_path / "c.npz"), "--share", "0.3"])
+    with pytest.raises(UserError, match="c.txt: valid: a name that ends in .npz"):
+        policies.main(["ship", str(paths[0]), str(tmp_path / "c.txt")])
     assert not (tmp_path / "c.npz").exists()
 
 
@@ -198,6 +200,19 @@ def test_ancestry_is_kept(whole, tmp_path):  # noqa: F811
     policies.main(["blend", str(c), str(b), str(a)])
     told = policies.ship(c, tmp_path / "d.npz")
     assert told["carried"] == whole.name and told["blend"] == {"with": ["a.npz"], "share": 0.5}
+
+
+def test_carried_without_its_lead(whole, tmp_path, char, capsys):  # noqa: F811
+    """Carried to another character or to the headset alone, a led policy is what it was before its lead."""
+    led, files = str(tmp_path / "led.npz"), [str(tmp_path / f"{n}.npz") for n in "abcdef"]
+    policies.main(["ship", str(whole), led, "--lead", "0.08"])
+    for k, flags in enumerate((["--sensors", "hmd"], ["--character", "dino"], ["--hidden", "40"])):
+        for old, new in zip((str(whole), led), files[2 * k : 2 * k + 2], strict=True):
+            policies.main(["carry", old, new, *flags])
+        (plain, _), (other, meta) = load_policy(files[2 * k]), load_policy(files[2 * k + 1])
+        close = np.allclose(plain.actor.params["W0"], other.actor.params["W0"], atol=1e-5)
+        assert close is (k < 2) and ("lead" in meta) is (k == 2)
+    assert capsys.readouterr().out.count("was shown its user 0.08 s ahead; no longer") == 2
 
 
 def test_led_by_command(whole, tmp_path, capsys):  # noqa: F811
@@ -265,8 +280,9 @@ def test_join_command(whole, tmp_path, char, capsys):  # noqa: F811
     policies.main(["ship", str(whole), led, "--lead", "0.05"])
     for files, flags, line in (
         ([hmd, str(whole)], arms, "sees user_previous.l.x, which .*hmd.npz does not"),
-        ([str(whole), hmd], ["--motors", "wing_*"], "--motors wing_.: 0 of the motors; valid: some of hip_l_y"),
-        ([str(whole), hmd], ["--motors", "*"], "33 of the motors"),
+        ([str(whole), hmd], ["--motors", "wing_*"], "--motors wing_.: none; valid: some of hip_l_y"),
+        ([str(whole), hmd], ["--motors", "elbow_*,wing_*"], "--motors wing_.: none; valid"),
+        ([str(whole), hmd], ["--motors", "*"], "--motors .: all; valid"),
         ([led, hmd], arms, "shown its user 0.05 s ahead; valid: .*--lead -0.05"),
     ):
         with pytest.raises(UserError, match=line):

@@ -25,7 +25,8 @@ def test_captures(tmp_path):
     few = streamed.Set("walks", "builtin", whole=True)
     assert {c.name for c in streamed.captures_of(few, tmp_path, "report")} == names[0] | names[1]
     assert {c.name for c in streamed.captures_of(few, tmp_path, "select")} == names[0]  # chosen on no more than others
-    assert streamed.captures_of(streamed.Set("gone", "bandai"), tmp_path, "report") == []
+    for nowhere in (tmp_path, Path()):
+        assert streamed.captures_of(streamed.Set("gone", "bandai"), nowhere, "report") == []
 
 
 def test_together():

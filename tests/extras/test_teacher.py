@@ -253,10 +253,9 @@ def test_command(start, tmp_path, capsys):
         (["--gpu"], "--gpu: a student copies on the processor"),
         (["--expert", "*=x.npz", "--joints", "tail"], "--joints: beside --expert no joints are taught"),
         (["--drive", "0.5"], "--drive: an expert drives: valid with --expert"),
-        (
-            ["--pull", "0.1", "--expert", "*=x.npz"],
-            "--pull: pulls arms to the teacher's: leave out --expert, or --pull",
-        ),
+        (["--pull", "0.1", "--teacher-lr", "0.1"], "--teacher-lr: is of copying: beside --pull"),
+        (["--pull", "0.1", "--expert", "*=x.npz"], "--pull: pulls arms to the teacher's: leave out --expert"),
+        (["--joints", ""], "--joints: none; valid: ankle"),
     ):
         with pytest.raises(SystemExit):
             run_main(teacher.main, [*TINY, "--init", str(start), *flags, "--out", str(tmp_path / "a")])

@@ -15,7 +15,7 @@ import ppo
 import retarget
 from character import TERMS
 from env import Env, Uniform, headset_only
-from extras import train
+from extras import teacher, train
 from extras.train import Curriculum, Disturbance, Options
 from headset import body
 from mocap import augment, data
@@ -515,6 +515,10 @@ def test_ppo_hands_on(tmp_path, capsys):
     ppo.main(["--resume", "--out", str(out), "--steps", "128"])
     arrays, meta = load_checkpoint(out / CHECKPOINT)
     assert meta["updates"] == 2 and arrays["env.starts.lost"].shape == (train.PLACES,)
+    before = (out / "config.json").read_bytes()
+    with pytest.raises(UserError, match="was trained by extras.train; valid: python ppo.py --resume --out"):
+        teacher.main(["--resume", "--out", str(out)])  # its rows would not fit, and no teacher has taught
+    assert (out / "config.json").read_bytes() == before
     with pytest.raises(UserError, match="was started with --balance True"):
         ppo.main(["--resume", "--out", str(out), "--no-balance"])
     for module in ("extras.nothing", "extras.gpu"):

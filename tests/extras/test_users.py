@@ -147,7 +147,7 @@ def test_by_time(clip):
         return Ride(empty, empty, empty, anew, Counter(fall=len(cuts)), 0.0, 0.0, 0.0)
 
     row = users.times_of([ridden(600), ridden(600, 150, 180), ridden(599)], [20 * seconds, 10 * seconds, seconds])
-    assert (row["captures"], row["without failure"], row["failures"]) == (3, 1, 1)  # one life too short, one ride, too
+    assert (row["captures"], row["without failure"], row["failures after 3 s"]) == (3, 1, 1)  # others are too short
     since = [20 * (np.arange(a * 30, b * 30) / 30).mean() for a, b in users.SINCE.values()]
     before = [10 * (5.0 - t) for t in users.BEFORE]
     asked = dict(zip([*users.SINCE, *(f"{t:g} s before" for t in users.BEFORE)], since + before, strict=True))

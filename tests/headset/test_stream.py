@@ -867,7 +867,7 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
 
 
 def test_tally():
-    """Three rides by hand: one falls twice, after 10 and 25 of 40 ticks, one after 30 of 60, one never in 20."""
+    """By hand: one falls twice, in step 10 and 25 of 40, one in step 30 of 60, one never in 20; one in its last."""
 
     def ridden(ticks, *cuts):
         anew, empty = np.zeros(ticks, bool), np.zeros((ticks, 1))
@@ -875,8 +875,10 @@ def test_tally():
         return Ride(empty, empty, empty, anew, Counter(fall=len(cuts)), 0.0, 0.0, 0.0)
 
     found = tally([ridden(40, 10, 25), ridden(60, 30), ridden(20)])
-    asked = dict(seconds=4.0, completed=1 / 3, survival=(0.25 + 0.5 + 1.0) / 3, failures=3, fails_every_s=4 / 3)
-    assert found == pytest.approx(asked | dict(first_failure_s=20 / 30))
+    asked = dict(seconds=4.0, completed=1 / 3, survival=(9 / 40 + 29 / 60 + 1) / 3, failures=3, fails_every_s=4 / 3)
+    assert found == pytest.approx(asked | dict(first_failure_s=19 / 30))
+    last = replace(ridden(20), ends=Counter(fall=1))  # stood up after its last tick
+    assert (tally([last])["completed"], tally([last])["survival"]) == (0.0, 0.95)
     assert tally([ridden(20)])["fails_every_s"] == tally([ridden(20)])["first_failure_s"] == float("inf")
 
 

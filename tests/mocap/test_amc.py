@@ -525,6 +525,27 @@ def standing():
     return pose
 
 
+def test_cmu_rate(tmp_path, capsys):
+    """CMU's salsa is of 60 Hz: a conversion that says 30 or 120 is read at half, with a line; one that says 60, another
+    name, and whoever gives a rate, are left alone."""
+
+    def read(name, header, **how):
+        path = tmp_path / name
+        write_as(path, "lafan1", walk(2.0))
+        path.write_text(re.sub("Frame Time: .*", f"Frame Time: {header}", path.read_text()))
+        clip = mocap.data.from_bvh(path, rigs.Reading(**how))
+        return clip.rate, "recorded this dance at 60 Hz" in capsys.readouterr().err
+
+    assert read("61_salsa_02.bvh", 0.0333333) == (pytest.approx(15.0, rel=1e-4), True)
+    assert read("60_01.bvh", 0.0083333) == (pytest.approx(60.0, rel=1e-4), True)
+    assert read("60_01.bvh", 1 / 60) == (pytest.approx(60.0), False)
+    assert read("60_02_b.bvh", 0.0333333) == read("62_01.bvh", 0.0333333) == (pytest.approx(30.0, rel=1e-4), False)
+    assert read("61_salsa_02.bvh", 0.0333333, rate=30.0) == (30.0, False)
+    for name, how, rate in (("61", {}, 60.0), ("16", {}, 120.0), ("60", {"rate": 120.0}, 120.0)):
+        clip = rigs.from_amc(cmu_file(tmp_path, [standing()] * 3, name)[0], rigs.Reading(**how))
+        assert clip.rate == rate and ("at 60 Hz" in capsys.readouterr().err) is (rate == 60.0)
+
+
 def test_zero_pose_is_a_t_pose(tmp_path):
     """Hand values: frames of the zero pose, and joints where the rods end."""
     clip = rigs.from_amc(cmu_file(tmp_path, [{}] * 3)[0])

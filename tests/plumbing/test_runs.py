@@ -325,7 +325,7 @@ def test_damaged_checkpoints(tmp_path, kind):
     path = tmp_path / "x.npz"
     runs.save_checkpoint(path, ARRAYS, {})
     damage(path, kind)
-    said = {"empty": r"\(empty\)", "cut": r"\(cut short or damaged\)", "text": r"\(no .npz\)"}.get(kind, "")
+    said = {"empty": r"\(empty\)", "cut": r"\(cut short or damaged\)", "text": r"\(not a zip"}.get(kind, "")
     with pytest.raises(UserError, match=f"x.npz.*{said}.*save_checkpoint"):
         runs.load_checkpoint(path)
 

@@ -464,11 +464,33 @@ def test_play_png(here, capsys, monkeypatch):
     policy = small_policy(here / "p.npz")
     assert run("play", "--policy", policy, "--png", "sheet.png", "--seconds", 0.5, "--every", 0.25, "--threads", 1) == 0
     out = capsys.readouterr().out
-    assert "sheet.png" in out and re.search(r"stand_007: lived 0\.\d s of 0\.6", out)
+    assert "sheet.png" in out and re.search(r"stand_007: lived 0\.\d s of 0\.5", out)
     data = (here / "sheet.png").read_bytes()
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     width, height = struct.unpack(">II", data[16:24])
     assert width > 900 and height >= 360 and len(data) > 20_000  # several pictures, and not of one colour
+
+
+def test_play_is_as_long_as_asked(here, monkeypatch):
+    """A BVH is the whole motion or so many seconds, a picture ten or so many, never more than there are: no training
+    episode's 500 steps cut them."""
+    clip = load("builtin", clips="walk_105")[0]
+    monkeypatch.setattr(mocap.data, "sequences", lambda *_, **__: [clip])
+    asked = []
+
+    def simulated(char, ref, act, horizon, *_, **__):
+        asked.append(horizon)
+        raise UserError("seen")
+
+    monkeypatch.setattr(play, "simulate", simulated)
+    whole, policy = len(clip) - 1, small_policy(here / "p.npz")
+    assert whole > 700
+    for flags, steps in (
+        ("--bvh w.bvh", whole), ("--bvh w.bvh --seconds 20", 600), ("--png w.png", 300),
+        ("--png w.png --seconds 22", 660), ("--png w.png --bvh w.bvh", whole), ("--png w.png --seconds 99", whole),
+    ):  # fmt: skip
+        assert run("play", "--policy", policy, *flags.split(), "--threads", 1) == 2
+        assert asked.pop() == steps, flags
 
 
 def test_run_main_reports_only_what_the_user_did(capsys):
