@@ -755,6 +755,8 @@ def run_comparison(opt: Options) -> tuple[list[Arm], list]:
     Test      tests/test_play.py::test_compare"""
     check_comparison(opt)
     check_folders(opt.json, read=(*mocap.data.parts(opt.motion), *opt.compare))
+    for path in opt.compare:
+        load_policy(path)  # a wrong name is said before motion is read, which takes long
     captures, long = motion_of(opt)
     arms = arms_of(long, opt)
     print(*(a.title() for a in arms), sep="\n")

@@ -761,9 +761,9 @@ def sequence_of(char: Character, opt) -> Reference:
 
 def look(char: Character, policy, path, meta, opt: Options) -> None:
     """Picture, film, write as BVH or show one sequence.  Test: tests/robustness/test_cli.py::test_play_png"""
-    ref = sequence_of(char, opt)
+    check_fits(policy, Player(char, policy.mean_action, devices=metrics.devices_of(meta, path, opt.sensors)), path)
+    ref = sequence_of(char, opt)  # which may take long
     seen, push = metrics.shown_to(meta, path, ref, opt.sensors), parse_push(opt.push)
-    check_fits(policy, Env(char, seen, 1), path)
     if opt.png or opt.video or opt.bvh:
         told = max(1, round(opt.seconds * CONTROL_RATE)) if opt.seconds else None
         whole = max(len(ref) - 1, 1)
