@@ -622,8 +622,8 @@ def test_streamed_row_of_known_rides(char, monkeypatch):
     lengths = [len(s[0]) for s in streams]
     assert (row["clips"], row["failures"]) == (3, 3) and row["completed"] == pytest.approx(1 / 3)
     assert row["within_1m"] == 0.0  # who completes was 1.2 m off once; who was near failed
-    assert row["survival"] == pytest.approx((1 + 40 / lengths[1] + 10 / lengths[2]) / 3)
-    assert row["first_failure_s"] == pytest.approx(25 / 30) and row["fails_every_s"] == pytest.approx(
+    assert row["survival"] == pytest.approx((1 + 39 / lengths[1] + 9 / lengths[2]) / 3)
+    assert row["first_failure_s"] == pytest.approx(24 / 30) and row["fails_every_s"] == pytest.approx(
         sum(lengths) / 30 / 3
     )
     head, hands, torque, agree, mj = [], [], [], [], mujoco.MjData(char.model)
