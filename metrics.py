@@ -695,6 +695,7 @@ class Arm:
         options, parts = self.meta.get("options", {}), [name_of(self.char)]
         parts += [f"{fmt_count(steps)} steps"] if (steps := total_steps(self.meta)) else []
         parts += [f"without {' '.join(map(str, options['without']))}"] if options.get("without") else []
+        parts += [f"trained with {'; '.join(reward)}"] if (reward := self.meta.get("reward")) else []
         parts += [f"carried over from {of}, not trained since"] if (of := self.meta.get("carried")) else []
         parts += ["root tracked only"] if options.get("track") == "root" else []
         if sensors_of(self.meta, self.path) == "hmd":

@@ -93,14 +93,20 @@ def led(policy: Policy, char: Character, seconds: float, devices=3) -> Policy:
     return policy
 
 
+def parted(changes) -> tuple[list[str], list[str]]:
+    """The changes of --set: those of the body, and those of the reward, which it plays without.
+
+    Test      tests/extras/test_policies.py::test_ship_names_the_reward"""
+    each = [c.strip() for c in (changes or "").split(";") if c.strip()]
+    return [c for c in each if not c.startswith("reward")], [c for c in each if c.startswith("reward")]
+
+
 def _body(meta, path) -> tuple:
     """Which body a policy was trained with: the character and its variation, rewards left out; () of none named."""
     own = trained_as(meta, path)
     if own is None:
         return ()
-    changes = {c.strip() for c in (own.set or "").split(";")}
-    body = sorted(c for c in changes if c and not c.startswith("reward"))
-    return Path(own.character).stem, own.tail, own.scale, *body
+    return Path(own.character).stem, own.tail, own.scale, *sorted(set(parted(own.set)[0]))
 
 
 TRAINED = "weights trained on "
@@ -189,6 +195,10 @@ def ship(run, path, blend=(), share=0.5, gain=1.0, lead=0.0) -> dict:
     kept = {"policy": meta["policy"], "steps": total_steps(meta), "data": meta["data"]}
     kept["options"] = meta["options"] | {"motion": ",".join(map(data.set_name, sets)), "out": None, "init": None}
     kept["options"] |= {"players": None}  # among the motions now
+    body, reward = parted(meta["options"].get("set"))
+    kept["options"] |= {"set": "; ".join(body) or None}
+    reward = sorted({*reward, *meta.get("reward", ())})
+    kept |= {"reward": reward} if reward else {}
     if experts := pairs_of(meta["options"].get("expert")):  # a policy's name, no folder of this machine
         kept["options"]["expert"] = [f"{pattern}={Path(file).name}" for pattern, file in experts]
     policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})

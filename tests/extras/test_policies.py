@@ -8,6 +8,7 @@ import pytest
 from test_ppo import train, whole  # noqa: F401, whole is a fixture
 
 import character
+import metrics
 import nn
 import ppo
 import retarget
@@ -51,6 +52,21 @@ def test_ship(tmp_path, monkeypatch):
     assert load_policy(target)[1]["options"]["motion"] == "builtin,motion,standing"
     with pytest.raises(UserError):
         policies.ship(tmp_path / "nothing", target)
+
+
+def test_ship_names_the_reward(whole, tmp_path):  # noqa: F811
+    """Trained with another reward it plays the same body: shipped, it says so apart from the body's changes."""
+    policy, meta = load_policy(whole)
+    change = {"set": "reward.contact=[4, 1]; pose.spine_y=0.1"}
+    save_checkpoint(tmp_path / "a.npz", policy.arrays(), meta | {"options": meta["options"] | change})
+    told = policies.ship(tmp_path / "a.npz", tmp_path / "b.npz")
+    assert told["options"]["set"] == "pose.spine_y=0.1" and told["reward"] == ["reward.contact=[4, 1]"]
+    assert policies.ship(tmp_path / "b.npz", tmp_path / "c.npz")["reward"] == ["reward.contact=[4, 1]"]
+    assert "reward" not in policies.ship(whole, tmp_path / "d.npz")
+    clip = data.load("builtin", clips="stand_007")[:1]
+    [arm] = metrics.arms_of(clip, metrics.Options(compare=(str(tmp_path / "c.npz"),), threads=1))
+    assert arm.title().endswith("trained with reward.contact=[4, 1]")
+    assert arm.char.variant == {"set": ["pose.spine_y=0.1"]}
 
 
 def kept(path, **meta):
