@@ -213,7 +213,7 @@ def test_text():
     assert render.text_mask("ab", 3).shape == (21, 36)
     np.testing.assert_array_equal(render.text_mask("é"), render.text_mask("?"))
     glyphs = set(render.FONT.values())
-    assert len(glyphs) == len(render.FONT) == 50 and all(len(glyph) == 14 for glyph in glyphs)
+    assert len(glyphs) == len(render.FONT) == 54 and all(len(glyph) == 14 for glyph in glyphs)
 
 
 def test_contact_sheet():
