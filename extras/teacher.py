@@ -285,6 +285,11 @@ def main(argv=None):
         raise UserError("--pull: pulls arms to the teacher's: leave out --expert, or --pull")
     if opt.pull and "teacher_lr" in given_names(argv):
         raise UserError("--teacher-lr: is of copying: beside --pull the learning rate is --lr")
+    if not opt.expert:  # what is wrong is said before motions are read, which takes minutes
+        taught(opt.load(), opt.joints)
+    for _, path in pairs_of(opt.expert):
+        if path:
+            load_policy(path)
     ppo.train(opt, train.make_env(opt), trainer=Pulled if opt.pull else Student)
 
 
