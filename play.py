@@ -563,19 +563,30 @@ def slides_of(char: Character, ride) -> np.ndarray:
     return np.concatenate([metrics.own_slide(soles[a:b], contact[a:b], CONTROL_RATE) for a, b in ride.lives])
 
 
+def errors_of(rides, slides, devices: int) -> dict:
+    """Means over all ticks of several rides; nan where there is nothing to tell of.
+
+    Args      slides : `slides_of` each
+    Test      tests/headset/test_stream.py::test_slides_as_measured"""
+    ticks, slides = sum(len(r.qpos) for r in rides), np.concatenate(slides)
+    return {
+        "head_cm": 100 * sum(r.head for r in rides) / ticks,
+        "hands_cm": 100 * sum(r.hands for r in rides) / ticks if devices == 3 else float("nan"),
+        "own_slide_cm_s": 100 * float(slides.mean()) if len(slides) else float("nan"),
+    }
+
+
 def summary_of(rides, slides, devices: int) -> dict:
     """Seconds, failures and errors of one ride, or of several together; `completed` is the share of them.
 
     Args      slides : `slides_of` each
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
-    counts, ticks, slides = tally(rides), sum(len(r.qpos) for r in rides), np.concatenate(slides)
+    counts = tally(rides)
     return {
         "seconds": round(counts["seconds"], 3),
         **{k: counts[k] for k in ("completed", "survival", "failures")},
         "fails_every_s": counts["fails_every_s"] if counts["failures"] else None,
-        "head_cm": 100 * sum(r.head for r in rides) / ticks,
-        "hands_cm": 100 * sum(r.hands for r in rides) / ticks if devices == 3 else None,
-        "own_slide_cm_s": 100 * float(slides.mean()) if len(slides) else None,
+        **{k: None if np.isnan(v) else v for k, v in errors_of(rides, slides, devices).items()},
     }
 
 
@@ -768,9 +779,8 @@ def look(char: Character, policy, path, meta, opt: Options) -> None:
         told = max(1, round(opt.seconds * CONTROL_RATE)) if opt.seconds else None
         whole = max(len(ref) - 1, 1)
         last = min(told or (round(10.0 * CONTROL_RATE) if opt.png or opt.video else whole), whole)
-        shown = last / CONTROL_RATE
-        if push and push.at >= shown:
-            says = f"only {shown:.1f} s are shown: push earlier, or give more --seconds"
+        if push and push.at >= last / CONTROL_RATE:
+            says = f"only {last / CONTROL_RATE:.1f} s are shown: push earlier, or give more --seconds"
             raise UserError(f"--push {opt.push}: {says}")
         horizon = whole if opt.bvh and not told else last
         recording = simulate(char, seen, policy_action(policy), horizon, opt.threads, push=push)[0]
@@ -780,7 +790,7 @@ def look(char: Character, policy, path, meta, opt: Options) -> None:
             + (f"; pushed by {push.newtons:g} N at {push.at:g} s" if push and push.at < lived else "")
         )
         if opt.bvh:
-            opt.write_bvh(char, recording.qpos[: told + 1 if told else None], CONTROL_RATE)
+            opt.write_bvh(char, recording.qpos, CONTROL_RATE)
         _write_pictures(char, seen, recording, min(last, len(recording.frames) - 1), opt)
     if opt.view:
         show(char, seen, policy, 0, opt.view, opt.port, push)

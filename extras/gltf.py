@@ -316,10 +316,10 @@ def recorded(char: Character, policy, path, meta, opt: Options):
     ref = play.sequence_of(char, opt)
     seen = shown_to(meta, path, ref, opt.sensors)
     check_fits(policy, Env(char, seen, 1), path)
-    last = min(round(opt.seconds * CONTROL_RATE) if opt.seconds else len(ref), len(ref) - 1)
-    recording = simulate(char, seen, policy_action(policy), max(last, 1), opt.threads)[0]
+    horizon = max(1, round(opt.seconds * CONTROL_RATE) if opt.seconds else len(ref) - 1)
+    recording = simulate(char, seen, policy_action(policy), horizon, opt.threads)[0]
     print(play.told_life(ref.names[0], recording))
-    return recording.qpos[: last + 1]
+    return recording.qpos
 
 
 def main(argv=None) -> None:

@@ -259,11 +259,6 @@ def joined(one: Policy, other: Policy, inputs, own) -> Policy:
     return out
 
 
-def unled(path, lead) -> str:
-    """The command that takes a lead back, exactly (`led`)."""
-    return f"python -m extras.policies ship {path} NEW.npz --lead {-lead:g}"
-
-
 def join(out_path, one_path, other_path, motors) -> dict:
     """Write one network of two policies of a character (`joined`).  -> what its file says
 
@@ -285,7 +280,8 @@ def join(out_path, one_path, other_path, motors) -> dict:
         raise UserError(f"--motors {odd}: {'all' if own.all() else 'none'}; valid: some of {', '.join(names)}")
     for path, m in ((one_path, meta), (other_path, its)):
         if lead := m.get("lead"):  # PPO that goes on unlearns it
-            raise UserError(f"{path}: is shown its user {lead:g} s ahead; valid: without, as by {unled(path, lead)}")
+            undo = f"python -m extras.policies ship {path} NEW.npz --lead {-lead:g}"
+            raise UserError(f"{path}: is shown its user {lead:g} s ahead; valid: without, as by {undo}")
     have, need = (input_names(char, devices_of(m, p, None), False) for m, p in ((meta, one_path), (its, other_path)))
     if lacking := [n for n in need if n not in have]:
         raise UserError(f"{other_path}: sees {lacking[0]}, which {one_path} does not; valid: in the other order")
@@ -293,8 +289,8 @@ def join(out_path, one_path, other_path, motors) -> dict:
         policy = joined(one, other, [have.index(n) for n in need], own)
     except ValueError as e:
         raise UserError(f"join {one_path} {other_path}: {e}; valid: networks of as many layers") from None
-    kept = {k: meta[k] for k in ("data", "steps") if k in meta} | {"policy": policy.shape()}
-    kept["steps"] = total_steps(meta)
+    kept = {k: meta[k] for k in ("data", "reward") if k in meta}
+    kept |= {"policy": policy.shape(), "steps": total_steps(meta)}
     kept["options"] = meta["options"] | {"hidden": list(policy.hidden), "init": None, "out": None}
     kept["licence"] = each_once(licences_of(meta, one_path) + licences_of(its, other_path)) or "MIT"
     kept["joined"] = {"with": Path(other_path).name, "motors": list(motors)}
@@ -468,7 +464,7 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
     )
     options = meta.get("options", {}) | {"sensors": sensors, "without": list(opt.without)}
     options |= {"hidden": list(policy.hidden), "value_hidden": list(policy.value_hidden), "init": None, "out": None}
-    kept = {k: meta[k] for k in ("data", "blend", "gain", "lead") if k in meta}
+    kept = {k: meta[k] for k in ("data", "blend", "gain", "lead", "reward") if k in meta}
     kept["licence"] = each_once(licences_of(meta, path)) or "MIT"  # what it began from is not named any more
     kept |= {"policy": policy.shape(), "options": options, "steps": total_steps(meta), "carried": Path(path).name}
     return policy, kept | {"versions": versions(), "git": git_state()}
@@ -543,7 +539,12 @@ def check_new(out) -> None:
         raise UserError(f"{out} exists already: valid: the name of a new file (of blend and join it stands first)")
 
 
-WORDS = {"ship": (2, 2), "carry": (2, 2), "join": (3, 3), "blend": (3, 100)}  # files a command wants, least and most
+COMMANDS = {  # how many files each wants, least and most; its flags; how it is called
+    "ship": (2, 2, Ship, "ship RUN OUT.npz"),
+    "blend": (3, 100, Blend, "blend OUT.npz A B …"),
+    "join": (3, 3, Join, "join OUT.npz A B"),
+    "carry": (2, 2, Carry, "carry OLD.npz NEW.npz"),
+}
 
 
 def main(argv=None):
@@ -552,37 +553,25 @@ def main(argv=None):
     Test      tests/extras/test_policies.py::test_carry_command, test_join_command, test_ship, test_wrong_commands"""
     words, flags = words_first(argv)
     what, files = (words[0], words[1:]) if words else ("", [])
-    if not {"-h", "--help"} & set(flags):
-        least, most = WORDS.get(what, (1, 0))
-        if not least <= len(files) <= most:
-            asked = " ".join(words) or "no command"
-            ways = "ship RUN OUT.npz, blend OUT.npz A B …, join OUT.npz A B, carry OLD.npz NEW.npz"
-            raise UserError(f"{asked}: valid: {ways}, then flags")
-    if what == "carry":
-        opt = cli(Carry, flags, "extras.policies carry OLD.npz NEW.npz", __doc__)
-        check_folders(files[1], read=files[:1])
-        check_new(files[1])
-        meta = carry(*files, opt, given_flags(flags))
-        print(f"{files[1]}: {meta['options']['character']}, {fmt_count(meta['steps'])} steps before")
-        return
-    if what == "join":
-        opt = cli(Join, flags, "extras.policies join OUT.npz A B", __doc__)
-        check_folders(files[0], read=files[1:])
-        check_new(files[0])
-        meta = join(*files, opt.motors)
-        print(f"{files[0]}: {', '.join(opt.motors)} of {files[1]}, the rest of {files[2]}; {meta['licence']}")
-        return
-    if what == "blend":
-        opt = cli(Blend, flags, "extras.policies blend OUT.npz A B …", __doc__)
-    else:
-        opt = cli(Ship, flags, "extras.policies ship RUN OUT.npz" if what else "extras.policies ship|blend|…", __doc__)
-    run, out, *others = files if what == "ship" else [files[1], files[0], *files[2:]]
-    check_folders(out, read=[run, *others])
+    least, most, kind, usage = COMMANDS.get(what, (1, 0, Ship, "|".join(COMMANDS) + " FILE …"))
+    if not {"-h", "--help"} & set(flags) and not least <= len(files) <= most:
+        ways = ", ".join(way for *_, way in COMMANDS.values())
+        raise UserError(f"{' '.join(words) or 'no command'}: valid: {ways}, then flags")
+    opt = cli(kind, flags, f"extras.policies {usage}", __doc__)
+    out, *read = files if what in ("blend", "join") else files[::-1]
+    check_folders(out, read=read)
     check_new(out)
-    share = opt.share if others else 0.5
-    meta = ship(run, out, others, share, opt.gain, opt.lead)
-    mixed = f", {1 - share:g} of it and {share:g} of {', '.join(others)}" if others else ""
-    print(f"{out}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}{mixed}; {meta['licence']}")
+    if what == "carry":
+        meta = carry(*files, opt, given_flags(flags))
+        print(f"{out}: {meta['options']['character']}, {fmt_count(meta['steps'])} steps before")
+    elif what == "join":
+        meta = join(*files, opt.motors)
+        print(f"{out}: {', '.join(opt.motors)} of {read[0]}, the rest of {read[1]}; {meta['licence']}")
+    else:
+        run, *others = read
+        meta = ship(run, out, others, **asdict(opt))
+        mixed = f", {1 - opt.share:g} of it and {opt.share:g} of {', '.join(others)}" if others else ""
+        print(f"{out}: {fmt_count(meta['steps'])} steps on {meta['options']['motion']}{mixed}; {meta['licence']}")
 
 
 if __name__ == "__main__":

@@ -157,7 +157,7 @@ class Student(ppo.Trainer):
 
     def __init__(self, opt: Options, env: Env, policy=None):
         super().__init__(opt, env, policy)
-        self.old = None if opt.pull else load_policy(opt.init)[0]
+        self.old, _ = load_policy(opt.init)
         self.experts, self.whose = experts(opt.expert, env)
         self.arms = np.array([], int) if opt.expert else taught(env.char, opt.joints)
         self.teacher = None if opt.expert else Teacher(env)
@@ -234,19 +234,20 @@ def pulled(mu, wanted, motors, log_std, weight):
     return 0.5 * float(np.sum(dmu[:, motors] * error)), dmu
 
 
-class Pulled(Student):
+class Pulled(ppo.Trainer):
     """PPO as ever, with the teacher's pull on the arms.
 
+    wanted    : (horizon, N, u) the teacher's actions
     Test      tests/extras/test_teacher.py::test_pulled_student"""
 
     def __init__(self, opt: Options, env: Env, policy=None):
         super().__init__(opt, env, policy)
-        self.adam_pi.lr = opt.lr
+        self.arms, self.teacher, self.wanted = taught(env.char, opt.joints), Teacher(env), np.zeros_like(self.mu)
 
     def step(self, t):
         """As PPO's, and what the arms should have done."""
         self.wanted[t] = self.teacher()
-        ppo.Trainer.step(self, t)
+        super().step(t)
 
     def samples(self):
         """PPO's, with the teacher's actions."""
@@ -262,7 +263,7 @@ class Pulled(Student):
     def update(self) -> dict:
         """PPO's update; how far the arms were from the teacher's before it."""
         error = (self.mu - self.wanted)[..., self.arms]
-        return ppo.Trainer.update(self) | {"taught_rms": float(np.sqrt(np.square(error).mean()))}
+        return super().update() | {"taught_rms": float(np.sqrt(np.square(error).mean()))}
 
     @staticmethod
     def line(stats) -> dict:

@@ -32,7 +32,7 @@ from headset.player import Player, from_user, ride, stream_of, tally
 from human import SEG, SENSOR_OFFSETS, headset_height, quat_about, quat_conj, quat_mul, quat_rotate
 from mocap.augment import looking, resize, warp
 from mocap.data import CONTROL_RATE, parts, stitched
-from play import slides_of
+from play import errors_of, slides_of
 from plumbing.cli import THREADS, UserError, arg, cell, cli, given_flags, markdown, run_main
 from plumbing.files import atomic_write, check_folders
 from policy import check_fits, devices_of, find_policy, load_character
@@ -163,18 +163,14 @@ def row_of_streams(char: Character, act, streams, devices, threads, push=None) -
     Errors    of headset and controllers over all frames [cm]; own slide without the jumps to where it is stood up
     Test      tests/extras/test_users.py::test_row"""
     rides = ride(char, act, streams, devices, threads, push.force if push else None)
-    ends, slides = sum((r.ends for r in rides), Counter()), np.concatenate([slides_of(char, r) for r in rides])
-    total = sum(len(r.qpos) for r in rides)
-    counts = tally(rides)
+    counts, ends = tally(rides), sum((r.ends for r in rides), Counter())
     return {
         "captures": len(rides),
         **{k: counts[k] for k in ("completed", "survival", "fails_every_s", "first_failure_s")},
         "falls": ends["fall"],
         "lost": ends["away"],
         "diverged": ends["bad"],
-        "head_cm": 100 * sum(r.head for r in rides) / total,
-        "hands_cm": 100 * sum(r.hands for r in rides) / total if devices == 3 else float("nan"),
-        "own_slide_cm_s": 100 * float(slides.mean()) if len(slides) else float("nan"),
+        **errors_of(rides, [slides_of(char, r) for r in rides], devices),
     }
 
 

@@ -330,9 +330,7 @@ def read(path, reading=AS_IT_IS, quiet=False) -> bvh.Bvh:
     except OSError as e:
         raise UserError(f"{path}: {e.strerror or e}; expected a regular .bvh file") from None
     _check_moving(path, len(b.names), b.values.shape[1])
-    if not reading.rate and (slower := cmu_rate(path, 1.0 / b.frame_time)):
-        if not quiet:
-            say(path, _twice(1.0 / b.frame_time))
+    if not reading.rate and (slower := cmu_rate(path, 1.0 / b.frame_time, quiet)):
         b = replace(b, frame_time=1.0 / slower)
     if reading.rest_pose == "keep" or not may_rest(b.values):
         return b
@@ -345,19 +343,19 @@ def read(path, reading=AS_IT_IS, quiet=False) -> bvh.Bvh:
 CMU_60 = re.compile(r"6[01]_(salsa_)?\d\d")  # file names of CMU's subjects 60 and 61, who dance salsa
 
 
-def cmu_rate(path, rate) -> float | None:
-    """Half the rate, for captures of CMU that were recorded at 60 Hz and are said to be of 120; None for others.
+def cmu_rate(path, rate, quiet=False) -> float | None:
+    """Half the rate, and a line, for captures of CMU that were recorded at 60 Hz and are said to be of 120; else None.
 
     ASSUMED   subjects 60 and 61: as 120 Hz (30 in every fourth frame) eight beats of their salsa last 1.45 s, 331 a
               minute, and her pelvis turns at 20 rad/s; at half that 165, which is salsa's.  Some subjects of CMU's are
               of 60 Hz, and conversions that know one rate play them at twice their pace
     Test      tests/mocap/test_amc.py::test_cmu_rate"""
-    return rate / 2.0 if CMU_60.fullmatch(Path(path).stem) and round(rate) in (30, 120) else None
-
-
-def _twice(rate) -> str:
-    half = f"read at {rate / 2:.3g} frames a second; as it was: --rate {rate:.3g}"
-    return f"CMU recorded this dance at 60 Hz, and {rate:.3g} frames a second are those of 120: {half}"
+    if not CMU_60.fullmatch(Path(path).stem) or round(rate) not in (30, 120):
+        return None
+    if not quiet:
+        half = f"read at {rate / 2:.3g} frames a second; as it was: --rate {rate:.3g}"
+        say(path, f"CMU recorded this dance at 60 Hz, and {rate:.3g} frames a second are those of 120: {half}")
+    return rate / 2.0
 
 
 def _dropped(n) -> str:
@@ -589,10 +587,8 @@ def from_amc(path, reading=AS_IT_IS) -> Clip:
         raise UserError(f"{s.path}: the axes of its bones make no frame: {e}; expected CMU's bones") from None
     calibrations = np.stack([rig.calibration(segment) for segment in SEGMENTS])
     pose = amc.global_pose(s, motion)
-    slower = None if reading.rate else cmu_rate(path, AMC_RATE)
-    if slower:
-        say(path, _twice(AMC_RATE))
-    clip = human_clip(rig, calibrations, s.names, *pose, Path(path).stem, "", reading.rate or slower or AMC_RATE)
+    rate = reading.rate or cmu_rate(path, AMC_RATE) or AMC_RATE
+    clip = human_clip(rig, calibrations, s.names, *pose, Path(path).stem, "", rate)
     n = leading_rest(clip.pos) if reading.rest_pose != "keep" else 0
     if n:
         say(path, _dropped(n))

@@ -62,6 +62,8 @@ def test_ship_names_the_reward(whole, tmp_path):  # noqa: F811
     told = policies.ship(tmp_path / "a.npz", tmp_path / "b.npz")
     assert told["options"]["set"] == "pose.spine_y=0.1" and told["reward"] == ["reward.contact=[4, 1]"]
     assert policies.ship(tmp_path / "b.npz", tmp_path / "c.npz")["reward"] == ["reward.contact=[4, 1]"]
+    policies.main(["carry", str(tmp_path / "b.npz"), str(tmp_path / "e.npz"), "--hidden", "16"])
+    assert load_policy(tmp_path / "e.npz")[1]["reward"] == ["reward.contact=[4, 1]"]
     assert "reward" not in policies.ship(whole, tmp_path / "d.npz")
     clip = data.load("builtin", clips="stand_007")[:1]
     [arm] = metrics.arms_of(clip, metrics.Options(compare=(str(tmp_path / "c.npz"),), threads=1))
@@ -117,7 +119,7 @@ def test_each_once():
     assert policies.each_once([]) == ""
 
 
-def test_blended(tmp_path):
+def test_blended(tmp_path, capsys):
     """Shares of 0 and 1 are the two policies; between them weights, and the normaliser's variances, are means."""
     paths = tmp_path / "old", tmp_path / "new"
     for seed, path in enumerate(paths):
@@ -164,6 +166,7 @@ def test_blended(tmp_path):
     policies.ship(paths[1], tmp_path / "d.npz", [tmp_path / "less.npz"])  # another reward is the same body
     with pytest.raises(SystemExit):
         policies.main(["ship", str(paths[0]), str(tmp_path / "c.npz"), "--share", "0.3"])
+    assert "unknown argument --share" in capsys.readouterr().err
     with pytest.raises(UserError, match="c.txt: valid: a name that ends in .npz"):
         policies.main(["ship", str(paths[0]), str(tmp_path / "c.txt")])
     assert not (tmp_path / "c.npz").exists()

@@ -152,20 +152,8 @@ def test_pulled_student(start, tmp_path):
     """Arms come nearer to the teacher while PPO goes on; without a pull they do not.  Two and two updates are four."""
     found = []
     for name, pull in (("a", "3"), ("b", "1e-9")):
-        run(
-            tmp_path / name,
-            40,
-            "--init",
-            str(start),
-            "--lr",
-            "0.001",
-            "--epochs",
-            "4",
-            "--target-kl",
-            "0.2",
-            "--pull",
-            pull,
-        )
+        flags = f"--init {start} --lr 0.001 --epochs 4 --target-kl 0.2 --pull {pull}"
+        run(tmp_path / name, 40, *flags.split())
         rows = [row.split(",") for row in (tmp_path / name / "metrics.csv").read_text().splitlines()]
         taught = np.array([float(r[rows[0].index("taught_rms")]) for r in rows[1:]])
         found.append(taught[-10:].mean() / taught[:3].mean())

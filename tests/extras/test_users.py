@@ -1,17 +1,17 @@
 """extras/users.py: builds, the rows of the table, and one row against `metrics.streamed`."""
 
 import json
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from test_stream import ridden
 
 import character
 import metrics
 from extras import users
-from headset.player import AWAY, Ride, from_user, ride, stream_of
+from headset.player import AWAY, from_user, ride, stream_of
 from human import SEG, headset_height, sensors
 from mocap import data
 from mocap.augment import looking
@@ -140,11 +140,6 @@ def test_row(clip):
 def test_by_time(clip):
     """The distance from a user who goes 0.2 m/s faster, by hand; a start under the headset, and a limp one."""
     seconds = np.arange(600) / data.CONTROL_RATE
-
-    def ridden(ticks, *cuts):
-        anew, empty = np.zeros(ticks, bool), np.zeros((ticks, 1))
-        anew[[0, *cuts]] = True
-        return Ride(empty, empty, empty, anew, Counter(fall=len(cuts)), 0.0, 0.0, 0.0)
 
     row = users.times_of([ridden(600), ridden(600, 150, 180), ridden(599)], [20 * seconds, 10 * seconds, seconds])
     assert (row["captures"], row["without failure"], row["failures after 3 s"]) == (3, 1, 1)  # others are too short

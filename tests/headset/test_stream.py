@@ -866,14 +866,15 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
         assert "xxx: File name too long; valid: " in capsys.readouterr().err
 
 
+def ridden(ticks, *cuts):
+    """A ride of so many ticks that was stood up anew before these."""
+    anew, empty = np.zeros(ticks, bool), np.zeros((ticks, 1))
+    anew[[0, *cuts]] = True
+    return Ride(empty, empty, empty, anew, Counter(fall=len(cuts)), 0.0, 0.0, 0.0)
+
+
 def test_tally():
     """By hand: one falls twice, in step 10 and 25 of 40, one in step 30 of 60, one never in 20; one in its last."""
-
-    def ridden(ticks, *cuts):
-        anew, empty = np.zeros(ticks, bool), np.zeros((ticks, 1))
-        anew[[0, *cuts]] = True
-        return Ride(empty, empty, empty, anew, Counter(fall=len(cuts)), 0.0, 0.0, 0.0)
-
     found = tally([ridden(40, 10, 25), ridden(60, 30), ridden(20)])
     asked = dict(seconds=4.0, completed=1 / 3, survival=(9 / 40 + 29 / 60 + 1) / 3, failures=3, fails_every_s=4 / 3)
     assert found == pytest.approx(asked | dict(first_failure_s=19 / 30))
