@@ -4,6 +4,7 @@ r"""Policies made of policies: shipped, averaged, joined, carried over to anothe
     python -m extras.policies blend OUT.npz A B … --share 0.3          A's weights averaged with those of the others
     python -m extras.policies ship OLD.npz NEW.npz --lead 0.07         is shown its user 0.07 s ahead: is less late
     python -m extras.policies join OUT.npz A B --motors 'elbow_*'      one network of two: A's elbows, all else B's
+    python -m extras.policies join OUT.npz A B --backwards 0.15        or B where the headset goes backwards faster
     python -m extras.policies carry OLD.npz NEW.npz --character dino   to go on with as another character, another
                                                                        variation, with other sensors or wider layers
 
@@ -11,6 +12,7 @@ Each has flags of its own: `python -m extras.policies join --help`.  `carry` kee
 action did: where the limit or the spring of a joint has changed, the same torque is asked for.  `ppo.py --init NEW.npz`
 then goes on from it, as from what `join` made.
 
+[Jacobs91]    Jacobs et al., Adaptive mixtures of local experts, Neural Computation 1991
 [Wortsman22]  Wortsman et al., Model soups: averaging weights of multiple fine-tuned models, ICML 2022
 """
 
@@ -28,13 +30,15 @@ from character import Character
 from env import SENSORS, WITHOUT, observation_terms
 from mocap import data
 from mocap.data import CONTROL_RATE
-from nn import MLP, RunningNorm
+from nn import LEAKY_SLOPE, MLP, RunningNorm
 from plumbing.cli import ALL_POSITIVE, POSITIVE, UNIT, UserError, arg, cli, given_flags, run_main, some_of, words_first
 from plumbing.files import check_folders
 from plumbing.runs import fmt_count, git_state, save_checkpoint, versions
 from policy import Policy, devices_of, load_policy, sensors_of, total_steps, trained_as
 
+GATE = dict(width=0.1, depth=10.0, scale=3.0)  # of `gated`: m/s; how far units are put off; a unit's size.  ASSUMED
 LEADS = (lambda v: abs(v) <= 0.5, "from -0.5 to 0.5 s")
+SPEEDS = (lambda v: 0.0 <= v <= 5.0, "from 0 to 5 m/s")
 SIGMA = 0.135  # exploration noise of a policy that goes on as another character, where that one's recipe has none
 
 # ------------------------------------------------------------------------------------ ship, blend
@@ -259,24 +263,77 @@ def joined(one: Policy, other: Policy, inputs, own) -> Policy:
     return out
 
 
-def join(out_path, one_path, other_path, motors) -> dict:
-    """Write one network of two policies of a character (`joined`).  -> what its file says
+def gated(one: Policy, other: Policy, inputs, moves, speed, width, depth, scale) -> Policy:
+    r"""One network of two and of a gate: the other acts while a speed that is seen is above a threshold  [Jacobs91].
 
-    Args      motors : patterns of hinges, as in 'shoulder_*': those act by the first policy, the rest by the second,
-              which may know the headset alone
-    Raises    UserError: another body, a pattern that no motor or every motor fits, inputs that the first does not have,
-              a policy that is shown its user ahead
+    Equation  v = Σ_i m_i o_i; a ramp from 0 to 1 between t and t + w is (r_t − r_{t+w}) / c of two units of the first
+              layer, r_t = φ(c (v − t) / w), but for the leak of φ, which is constant where it is 0 or 1.  With
+              g_A = ramp at v_0 − 0.15 w, g_B = ramp at v_0 − 0.85 w the units of the second layer are
+              z_A − K g_A and z_B − K (1 − g_B): off, φ leaves s (z − K) of them, of which the last layer takes off
+              −s K (it reads both ramps by a unit each) and its bias is that of the one that acts
+    Symbols   v_0 speed [m/s], w width, K depth, c scale; φ the leaky ReLU with slope s; A one, B other
+    Why       what a walker does not unlearn (it stands until it falls where the user steps back), an expert of it
+              does; half of both, or a student that has not taken a step, falls.  The ramps cross at v_0 where both
+              have let go little.  PPO then goes on with all of it, the gate, too; sizes are such that no weight of it
+              changes the actions more than others do in a step of Adam
+    Args      inputs : as of `joined`; moves {i: m_i} of one's inputs
+    Returns   Policy with one's critic, normaliser and σ; as the one that acts but for s of what the other would do
+    Raises    ValueError: as `joined`; not two hidden layers of leaky ReLUs
+    Test      tests/extras/test_policies.py::test_gated
+    """
+    if len(one.hidden) != 2 or one.activation != "leaky_relu":
+        raise ValueError(f"hidden layers {one.hidden} of {one.activation}, expected two of leaky_relu")
+    both = joined(one, other, inputs, np.ones(one.action_size, bool))
+    (h, k), ours, slope = both.hidden, one.hidden[1], LEAKY_SLOPE
+    sizes = one.obs_size, one.critic_size, one.action_size, (h + 4, k + 2), one.value_hidden
+    out = Policy(*sizes, 1.0, one.value_scale, np.random.default_rng(0), one.theta_pi.dtype, one.activation)
+    w = {name: np.zeros(v.shape) for name, v in out.actor.params.items()}
+    for name, v in both.actor.params.items():
+        w[name][tuple(slice(n) for n in v.shape)] = v
+    at, by = list(moves), np.array(list(moves.values()))[:, None]
+    w["W0"][at, h:] = by / one.norm.inv_std[at, None] * (scale / width)
+    w["b0"][h:] = ((one.norm.mean[at] @ by) - speed) * (scale / width) + scale * np.array([0.85, 0.15, -0.15, -0.85])
+    g_b, g_a = (np.array(r) / (scale * (1.0 - slope)) for r in ([1, 0, -1, 0], [0, 1, 0, -1]))
+    leak = -slope / (1.0 - slope)  # what the two units of a ramp differ by where it is 0
+    w["W1"][h:, :ours], w["W1"][h:, ours:k] = -depth * g_a[:, None], depth * g_b[:, None]
+    w["b1"][:ours] -= depth * leak
+    w["b1"][ours:k] += depth * (leak - 1.0)
+    w["W1"][h:, k:] = np.stack([g_a, g_b], axis=1)
+    w["b1"][k:] = leak + 0.1  # so that neither is ever below 0
+    a, b = one.actor.params, {name: v.astype(float) for name, v in other.actor.params.items()}
+    w["W2"][ours:k] = b["W2"]
+    lost_a, lost_b = (slope * depth * p["W2"].astype(float).sum(axis=0) for p in (a, b))
+    w["W2"][k:] = lost_a - a["b2"], b["b2"] - lost_b
+    w["b2"][:] = a["b2"] + lost_b - 0.1 * w["W2"][k:].sum(axis=0)
+    for name, v in out.actor.params.items():
+        v[:] = w[name]
+    out.log_std[:] = one.log_std
+    out.critic.theta[:] = one.critic.theta
+    out.norm.load_state(one.norm.state())
+    return out
+
+
+def join(out_path, one_path, other_path, opt: Join) -> dict:
+    """Write one network of two policies of a character (`joined`, `gated`).  -> what its file says
+
+    Args      opt.motors : patterns of hinges, as in 'shoulder_*': those act by the first policy, the rest by the
+              second, which may know the headset alone; or opt.backwards [m/s]: the second acts while the headset goes
+              backwards, in the character's heading, faster than that
+    Raises    UserError: both or neither; another body, a pattern that no motor or every motor fits, inputs that the
+              first does not have, a policy that is shown its user ahead
     Test      tests/extras/test_policies.py::test_join_command"""
+    if bool(opt.motors) == bool(opt.backwards):
+        raise UserError("join: valid: one of --motors and --backwards")
     (one, meta), (other, its) = load_policy(one_path), load_policy(other_path)
     bodies = _body(meta, one_path), _body(its, other_path)
     if not all(bodies) or bodies[0] != bodies[1]:
         raise UserError(f"{other_path}: of the body {bodies[1]}; valid: as {one_path}, {bodies[0]}")
     char = trained_as(meta, one_path).load()
     names = [char.hinges[h] for h in char.driven]
-    fits = np.array([[fnmatch(name, pattern) for name in names] for pattern in motors]).reshape(-1, len(names))
+    fits = np.array([[fnmatch(name, pattern) for name in names] for pattern in opt.motors]).reshape(-1, len(names))
     own = fits.any(axis=0)
-    if own.all() or not own.any() or not fits.any(axis=1).all():
-        odd = next((m for m, f in zip(motors, fits) if not f.any()), ",".join(motors))
+    if opt.motors and (own.all() or not own.any() or not fits.any(axis=1).all()):
+        odd = next((m for m, f in zip(opt.motors, fits) if not f.any()), ",".join(opt.motors))
         raise UserError(f"--motors {odd}: {'all' if own.all() else 'none'}; valid: some of {', '.join(names)}")
     for path, m in ((one_path, meta), (other_path, its)):
         if lead := m.get("lead"):  # PPO that goes on unlearns it
@@ -285,15 +342,20 @@ def join(out_path, one_path, other_path, motors) -> dict:
     have, need = (input_names(char, devices_of(m, p, None), False) for m, p in ((meta, one_path), (its, other_path)))
     if lacking := [n for n in need if n not in have]:
         raise UserError(f"{other_path}: sees {lacking[0]}, which {one_path} does not; valid: in the other order")
+    inputs, step = [have.index(n) for n in need], {"user_previous.h.x": CONTROL_RATE, "user.h.x": -CONTROL_RATE}
     try:
-        policy = joined(one, other, [have.index(n) for n in need], own)
+        if opt.motors:
+            policy = joined(one, other, inputs, own)
+        else:
+            policy = gated(one, other, inputs, {have.index(n): m for n, m in step.items()}, opt.backwards, **GATE)
     except ValueError as e:
         raise UserError(f"join {one_path} {other_path}: {e}; valid: networks of as many layers") from None
     kept = {k: meta[k] for k in ("data", "reward") if k in meta}
     kept |= {"policy": policy.shape(), "steps": total_steps(meta)}
     kept["options"] = meta["options"] | {"hidden": list(policy.hidden), "init": None, "out": None}
     kept["licence"] = each_once(licences_of(meta, one_path) + licences_of(its, other_path)) or "MIT"
-    kept["joined"] = {"with": Path(other_path).name, "motors": list(motors)}
+    how = {"motors": list(opt.motors)} if opt.motors else {"backwards": opt.backwards}
+    kept["joined"] = {"with": Path(other_path).name} | how
     kept |= {"versions": versions(), "git": git_state()}
     save_checkpoint(out_path, policy.arrays(), kept)
     return kept
@@ -493,6 +555,7 @@ class Join:
     """What `join` can be told."""
 
     motors: tuple[str, ...] = arg((), "names of hinges, with * and ?: those of A's network act, of all others B's")
+    backwards: float = arg(0.0, "instead: B's network acts while the headset goes backwards faster, m/s", check=SPEEDS)
 
 
 @dataclass
@@ -565,8 +628,9 @@ def main(argv=None):
         meta = carry(*files, opt, given_flags(flags))
         print(f"{out}: {meta['options']['character']}, {fmt_count(meta['steps'])} steps before")
     elif what == "join":
-        meta = join(*files, opt.motors)
-        print(f"{out}: {', '.join(opt.motors)} of {read[0]}, the rest of {read[1]}; {meta['licence']}")
+        meta = join(*files, opt)
+        ours, rest = (", ".join(opt.motors), "the rest") if opt.motors else ("forwards", "backwards")
+        print(f"{out}: {ours} of {read[0]}, {rest} of {read[1]}; {meta['licence']}")
     else:
         run, *others = read
         meta = ship(run, out, others, **asdict(opt))

@@ -16,6 +16,7 @@ from env import Env, headset_only
 from extras import policies
 from extras.policies import Carry, carried, input_names
 from mocap import data
+from nn import LEAKY_SLOPE
 from plumbing.cli import UserError
 from plumbing.runs import CHECKPOINT, load_checkpoint, save_checkpoint
 from policy import Policy, load_policy, total_steps, trained_as
@@ -276,6 +277,42 @@ def test_joined():
         policies.joined(one, Policy(4, 5, 4, (8,), (2,), 0.2, 1.0, rng), inputs, own)
 
 
+def test_gated():
+    """Below the threshold the outputs are one policy's, above it the other's, each but for a hundredth of the other."""
+    rng = np.random.default_rng(6)
+    one, other = Policy(7, 9, 4, (60, 50), (3,), 0.1, 2.0, rng), Policy(5, 5, 4, (80, 30), (2,), 0.2, 1.0, rng)
+    for policy in (one, other):
+        policy.norm.update(rng.normal(1.0, 2.0, (40, policy.critic_size)))
+        for k, w in policy.actor.params.items():
+            w[:] = rng.normal(size=w.shape) / (np.sqrt(len(w)) if k.startswith("W") else 1.0)
+    inputs, speed, width, depth = [6, 0, 3, 4, 1], 0.5, 0.2, 40.0
+    both = policies.gated(one, other, inputs, {2: 3.0, 5: -3.0}, speed, width, depth, 3.0)
+    assert both.hidden == (144, 82)
+    x = rng.normal(1.0, 0.5, (4000, 9)).astype(np.float32)
+    v = 3.0 * (x[:, 2] - x[:, 5])
+    a, b, y = one.mean_action(x[:, :7]), other.mean_action(x[:, inputs]), both.mean_action(x[:, :7])
+
+    def last(policy, x):  # what the last hidden layer gives the outputs before its activation, bias aside
+        h, p = x, policy.actor.params
+        for i in (0, 1):
+            z = h @ p[f"W{i}"] + p[f"b{i}"]
+            h = np.maximum(z, LEAKY_SLOPE * z)
+        assert z.max() < 0.85 * depth  # a unit that is put off is off
+        return z @ p["W2"]
+
+    off_a, off_b = last(one, one.norm.normalise(x)[:, :7]), last(other, other.norm.normalise(x[:, inputs]))
+    below, above = v < speed - 0.85 * width, v > speed + 0.85 * width
+    assert below.sum() > 500 and above.sum() > 500
+    np.testing.assert_allclose(y[below], (a + LEAKY_SLOPE * off_b)[below], atol=2e-4)
+    np.testing.assert_allclose(y[above], (b + LEAKY_SLOPE * off_a)[above], atol=2e-4)
+    assert np.abs(a - b).mean() > 0.5 and np.abs(y - a)[below].mean() < 0.05
+    np.testing.assert_allclose(both.value(both.norm.normalise(x)), one.value(one.norm.normalise(x)), rtol=1e-6)
+    for hidden, activation in (((6,), "leaky_relu"), ((6, 5), "tanh")):
+        wrong = Policy(7, 9, 4, hidden, (3,), 0.1, 2.0, rng, activation=activation)
+        with pytest.raises(ValueError, match="expected two of leaky_relu"):
+            policies.gated(wrong, wrong, range(7), {2: 3.0}, speed, width, depth, 3.0)
+
+
 def test_join_command(whole, tmp_path, char, capsys):  # noqa: F811
     """The arms of one policy and the rest of one that knows the headset alone; training goes on from it."""
     hmd, out = str(tmp_path / "hmd.npz"), str(tmp_path / "both.npz")
@@ -303,10 +340,34 @@ def test_join_command(whole, tmp_path, char, capsys):  # noqa: F811
         ([str(whole), hmd], ["--motors", "elbow_*,wing_*"], "--motors wing_.: none; valid"),
         ([str(whole), hmd], ["--motors", "*"], "--motors .: all; valid"),
         ([led, hmd], arms, "shown its user 0.05 s ahead; valid: .*--lead -0.05"),
+        ([str(whole), hmd], [], "valid: one of --motors and --backwards"),
+        ([str(whole), hmd], [*arms, "--backwards", "0.2"], "valid: one of --motors and --backwards"),
     ):
         with pytest.raises(UserError, match=line):
             policies.main(["join", new, *files, *flags])
     assert not Path(new).exists()
+    with pytest.raises(UserError, match="hidden layers .12,. of leaky_relu, expected two"):
+        policies.main(["join", new, str(whole), hmd, "--backwards", "0.2"])
+
+
+def test_join_backwards(tmp_path, char, capsys):
+    """Forwards and standing one policy acts, backwards the other, which knows the headset alone."""
+    two, hmd, out = (str(tmp_path / n) for n in ("two", "hmd.npz", "both.npz"))
+    train(tmp_path / "two", 1, "--hidden", "12,8")
+    policies.main(["carry", two, hmd, "--sensors", "hmd"])
+    policies.main(["join", out, two, hmd, "--backwards", "0.2"])
+    assert "forwards of" in capsys.readouterr().out
+    (a, _), (b, _), (both, meta) = (load_policy(p) for p in (two, hmd, out))
+    assert meta["joined"] == {"with": "hmd.npz", "backwards": 0.2}
+    names = input_names(char, asymmetric=False)
+    x = (a.norm.mean + np.random.default_rng(0).normal(size=(200, 459)) / a.norm.inv_std)[:, : a.obs_size]
+    seen = [names.index(n) for n in input_names(char, 1, False)]
+    now, before = names.index("user.h.x"), names.index("user_previous.h.x")
+    for speed, acts, rests in ((-0.1, a, b), (0.5, b, a)):  # m/s, backwards
+        x[:, now] = a.norm.mean[now]
+        x[:, before] = x[:, now] + speed / 30.0
+        asked, left = (p.mean_action(x[:, seen] if p is b else x) for p in (acts, rests))
+        assert np.abs(both.mean_action(x) - asked).mean() < 0.05 * np.abs(asked - left).mean()
 
 
 # ------------------------------------------------------------------------------------ carry
