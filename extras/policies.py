@@ -4,7 +4,7 @@ r"""Policies made of policies: shipped, averaged, joined, carried over to anothe
     python -m extras.policies blend OUT.npz A B … --share 0.3          A's weights averaged with those of the others
     python -m extras.policies ship OLD.npz NEW.npz --lead 0.07         is shown its user 0.07 s ahead: is less late
     python -m extras.policies join OUT.npz A B --motors 'elbow_*'      one network of two: A's elbows, all else B's
-    python -m extras.policies join OUT.npz A B --backwards 0.15        or B where the headset goes backwards faster
+    python -m extras.policies join OUT.npz A B --backwards 0.15        or B where headset and root go backwards
     python -m extras.policies carry OLD.npz NEW.npz --character dino   to go on with as another character, another
                                                                        variation, with other sensors or wider layers
 
@@ -37,6 +37,7 @@ from plumbing.runs import fmt_count, git_state, save_checkpoint, versions
 from policy import Policy, devices_of, load_policy, sensors_of, total_steps, trained_as
 
 GATE = dict(width=0.1, depth=10.0, scale=3.0)  # of `gated`: m/s; how far units are put off; a unit's size.  ASSUMED
+ROOT_SHARE = 0.8  # of the speed that opens it: the character's own, the rest the headset's.  ASSUMED (RESULTS.md)
 LEADS = (lambda v: abs(v) <= 0.5, "from -0.5 to 0.5 s")
 SPEEDS = (lambda v: 0.0 <= v <= 5.0, "from 0 to 5 m/s")
 SIGMA = 0.135  # exploration noise of a policy that goes on as another character, where that one's recipe has none
@@ -317,8 +318,9 @@ def join(out_path, one_path, other_path, opt: Join) -> dict:
     """Write one network of two policies of a character (`joined`, `gated`).  -> what its file says
 
     Args      opt.motors : patterns of hinges, as in 'shoulder_*': those act by the first policy, the rest by the
-              second, which may know the headset alone; or opt.backwards [m/s]: the second acts while the headset goes
-              backwards, in the character's heading, faster than that
+              second, which may know the headset alone; or opt.backwards [m/s]: the second acts while headset and root
+              go backwards, in the character's heading, faster than that (ROOT_SHARE: a user's steps are not even, and
+              a network has no memory but its body)
     Raises    UserError: both or neither; another body, a pattern that no motor or every motor fits, inputs that the
               first does not have, a policy that is shown its user ahead
     Test      tests/extras/test_policies.py::test_join_command"""
@@ -342,12 +344,13 @@ def join(out_path, one_path, other_path, opt: Join) -> dict:
     have, need = (input_names(char, devices_of(m, p, None), False) for m, p in ((meta, one_path), (its, other_path)))
     if lacking := [n for n in need if n not in have]:
         raise UserError(f"{other_path}: sees {lacking[0]}, which {one_path} does not; valid: in the other order")
-    inputs, step = [have.index(n) for n in need], {"user_previous.h.x": CONTROL_RATE, "user.h.x": -CONTROL_RATE}
+    inputs, step = [have.index(n) for n in need], (1.0 - ROOT_SHARE) * CONTROL_RATE
+    moves = {"user_previous.h.x": step, "user.h.x": -step, "qd.vx": -ROOT_SHARE}  # m/s backwards
     try:
         if opt.motors:
             policy = joined(one, other, inputs, own)
         else:
-            policy = gated(one, other, inputs, {have.index(n): m for n, m in step.items()}, opt.backwards, **GATE)
+            policy = gated(one, other, inputs, {have.index(n): m for n, m in moves.items()}, opt.backwards, **GATE)
     except ValueError as e:
         raise UserError(f"join {one_path} {other_path}: {e}; valid: networks of as many layers") from None
     kept = {k: meta[k] for k in ("data", "reward") if k in meta}
@@ -555,7 +558,7 @@ class Join:
     """What `join` can be told."""
 
     motors: tuple[str, ...] = arg((), "names of hinges, with * and ?: those of A's network act, of all others B's")
-    backwards: float = arg(0.0, "instead: B's network acts while the headset goes backwards faster, m/s", check=SPEEDS)
+    backwards: float = arg(0.0, "instead: B's network acts while both go backwards faster, m/s", check=SPEEDS)
 
 
 @dataclass

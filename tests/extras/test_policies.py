@@ -362,9 +362,9 @@ def test_join_backwards(tmp_path, char, capsys):
     names = input_names(char, asymmetric=False)
     x = (a.norm.mean + np.random.default_rng(0).normal(size=(200, 459)) / a.norm.inv_std)[:, : a.obs_size]
     seen = [names.index(n) for n in input_names(char, 1, False)]
-    now, before = names.index("user.h.x"), names.index("user_previous.h.x")
-    for speed, acts, rests in ((-0.1, a, b), (0.5, b, a)):  # m/s, backwards
-        x[:, now] = a.norm.mean[now]
+    now, before, root = (names.index(n) for n in ("user.h.x", "user_previous.h.x", "qd.vx"))
+    for speed, own, acts, rests in ((-0.1, -0.1, a, b), (0.5, 0.05, a, b), (0.5, 0.4, b, a)):  # m/s, backwards
+        x[:, now], x[:, root] = a.norm.mean[now], -own
         x[:, before] = x[:, now] + speed / 30.0
         asked, left = (p.mean_action(x[:, seen] if p is b else x) for p in (acts, rests))
         assert np.abs(both.mean_action(x) - asked).mean() < 0.05 * np.abs(asked - left).mean()
