@@ -39,7 +39,7 @@ from policy import Policy, devices_of, load_policy, sensors_of, total_steps, tra
 GATE = dict(width=0.1, depth=10.0, scale=3.0)  # of `gated`: m/s; how far units are put off; a unit's size.  ASSUMED
 ROOT_SHARE = 0.8  # of the speed that opens it: the character's own, the rest the headset's.  ASSUMED (RESULTS.md)
 LEADS = (lambda v: abs(v) <= 0.5, "from -0.5 to 0.5 s")
-SPEEDS = (lambda v: 0.0 <= v <= 5.0, "from 0 to 5 m/s")
+SPEEDS = (lambda v: 0.0 < v <= 5.0, "above 0, at most 5 m/s")
 SIGMA = 0.135  # exploration noise of a policy that goes on as another character, where that one's recipe has none
 
 # ------------------------------------------------------------------------------------ ship, blend
@@ -324,7 +324,7 @@ def join(out_path, one_path, other_path, opt: Join) -> dict:
     Raises    UserError: both or neither; another body, a pattern that no motor or every motor fits, inputs that the
               first does not have, a policy that is shown its user ahead
     Test      tests/extras/test_policies.py::test_join_command"""
-    if bool(opt.motors) == bool(opt.backwards):
+    if bool(opt.motors) == (opt.backwards is not None):
         raise UserError("join: valid: one of --motors and --backwards")
     (one, meta), (other, its) = load_policy(one_path), load_policy(other_path)
     bodies = _body(meta, one_path), _body(its, other_path)
@@ -558,7 +558,7 @@ class Join:
     """What `join` can be told."""
 
     motors: tuple[str, ...] = arg((), "names of hinges, with * and ?: those of A's network act, of all others B's")
-    backwards: float = arg(0.0, "instead: B's network acts while both go backwards faster, m/s", check=SPEEDS)
+    backwards: float | None = arg(None, "instead: B's network acts while both go backwards faster, m/s", check=SPEEDS)
 
 
 @dataclass
