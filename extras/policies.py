@@ -267,18 +267,20 @@ def joined(one: Policy, other: Policy, inputs, own) -> Policy:
 def gated(one: Policy, other: Policy, inputs, moves, speed, width, depth, scale) -> Policy:
     r"""One network of two and of a gate: the other acts while a speed that is seen is above a threshold  [Jacobs91].
 
-    Equation  v = Σ_i m_i o_i; a ramp from 0 to 1 between t and t + w is (r_t − r_{t+w}) / c of two units of the first
-              layer, r_t = φ(c (v − t) / w), but for the leak of φ, which is constant where it is 0 or 1.  With
-              g_A = ramp at v_0 − 0.15 w, g_B = ramp at v_0 − 0.85 w the units of the second layer are
-              z_A − K g_A and z_B − K (1 − g_B): off, φ leaves s (z − K) of them, of which the last layer takes off
-              −s K (it reads both ramps by a unit each) and its bias is that of the one that acts
-    Symbols   v_0 speed [m/s], w width, K depth, c scale; φ the leaky ReLU with slope s; A one, B other
+    Equation  v = Σ_i m_i o_i of the raw observation, clipping left aside;  g(t) = min(1, max(0, (v − t) / w)),
+              g_A = g(v_0 − 0.15 w), g_B = g(v_0 − 0.85 w);  a = W_A φ(z_A − K g_A) + W_B φ(z_B − K (1 − g_B))
+              + b_A (1 − g_A) + b_B g_B + s K (g_A Σ W_A + (1 − g_B) Σ W_B)
+    Method    four units of the first layer, φ(c (v − t) / w), make the two ramps: two of them, w apart, differ by
+              c (s + (1 − s) g(t)); two units of the second layer hold g_A and g_B, plus 0.1, for what is linear in them
+    Symbols   v_0 speed [m/s], w width, K depth, c scale; z the second layer before φ, the leaky ReLU of slope s; W, b
+              the last layer; A one, B other
     Why       what a walker does not unlearn (it stands until it falls where the user steps back), an expert of it
-              does; half of both, or a student that has not taken a step, falls.  The ramps cross at v_0 where both
-              have let go little.  PPO then goes on with all of it, the gate, too; sizes are such that no weight of it
-              changes the actions more than others do in a step of Adam
+              does; half of both, or a student that has not taken a step, falls.  g_A and 1 − g_B cross at v_0, where
+              they are 0.15: there both act a little, never neither.  PPO then goes on with all of it, the gate, too;
+              sizes are such that no weight of it changes the actions more than others do in a step of Adam
     Args      inputs : as of `joined`; moves {i: m_i} of one's inputs
-    Returns   Policy with one's critic, normaliser and σ; as the one that acts but for s of what the other would do
+    Returns   Policy with one's critic, normaliser and σ; 0.85 w beside v_0 as the one that acts, but for s z W of the
+              other, if no z of it is above K
     Raises    ValueError: as `joined`; not two hidden layers of leaky ReLUs
     Test      tests/extras/test_policies.py::test_gated
     """

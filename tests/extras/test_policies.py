@@ -292,15 +292,22 @@ def test_gated():
     v = 3.0 * (x[:, 2] - x[:, 5])
     a, b, y = one.mean_action(x[:, :7]), other.mean_action(x[:, inputs]), both.mean_action(x[:, :7])
 
-    def last(policy, x):  # what the last hidden layer gives the outputs before its activation, bias aside
-        h, p = x, policy.actor.params
-        for i in (0, 1):
-            z = h @ p[f"W{i}"] + p[f"b{i}"]
-            h = np.maximum(z, LEAKY_SLOPE * z)
-        assert z.max() < 0.85 * depth  # a unit that is put off is off
-        return z @ p["W2"]
+    leaky = lambda z: np.maximum(z, LEAKY_SLOPE * z)  # noqa: E731
 
-    off_a, off_b = last(one, one.norm.normalise(x)[:, :7]), last(other, other.norm.normalise(x[:, inputs]))
+    def last(policy, x):  # the last hidden layer before its activation, and the last layer
+        p = policy.actor.params
+        z = leaky(x @ p["W0"] + p["b0"]) @ p["W1"] + p["b1"]
+        assert z.max() < 0.85 * depth  # a unit that is put off is off
+        return z.astype(float), p["W2"].astype(float), p["b2"].astype(float)
+
+    z_a, w_a, b_a = last(one, one.norm.normalise(x)[:, :7])
+    z_b, w_b, b_b = last(other, other.norm.normalise(x[:, inputs]))
+    off_a, off_b = z_a @ w_a, z_b @ w_b
+    g_a, g_b = (np.clip((v - speed) / width + edge, 0.0, 1.0)[:, None] for edge in (0.15, 0.85))
+    asked = leaky(z_a - depth * g_a) @ w_a + leaky(z_b - depth * (1.0 - g_b)) @ w_b + (1.0 - g_a) * b_a + g_b * b_b
+    asked += LEAKY_SLOPE * depth * (g_a * w_a.sum(axis=0) + (1.0 - g_b) * w_b.sum(axis=0))
+    np.testing.assert_allclose(y, asked, atol=1e-3)  # everywhere, the ramps, too
+    assert (np.abs(v - speed) < 0.5 * width).sum() > 50
     below, above = v < speed - 0.85 * width, v > speed + 0.85 * width
     assert below.sum() > 500 and above.sum() > 500
     np.testing.assert_allclose(y[below], (a + LEAKY_SLOPE * off_b)[below], atol=2e-4)
@@ -363,7 +370,8 @@ def test_join_backwards(tmp_path, char, capsys):
     x = (a.norm.mean + np.random.default_rng(0).normal(size=(200, 459)) / a.norm.inv_std)[:, : a.obs_size]
     seen = [names.index(n) for n in input_names(char, 1, False)]
     now, before, root = (names.index(n) for n in ("user.h.x", "user_previous.h.x", "qd.vx"))
-    for speed, own, acts, rests in ((-0.1, -0.1, a, b), (0.5, 0.05, a, b), (0.5, 0.4, b, a)):  # m/s, backwards
+    cases = (-0.1, -0.1, a, b), (0.5, 0.05, a, b), (0.5, 0.4, b, a), (-1.5, 0.4, a, b)  # m/s, backwards: headset, root
+    for speed, own, acts, rests in cases:
         x[:, now], x[:, root] = a.norm.mean[now], -own
         x[:, before] = x[:, now] + speed / 30.0
         asked, left = (p.mean_action(x[:, seen] if p is b else x) for p in (acts, rests))
