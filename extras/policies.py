@@ -224,6 +224,19 @@ def ship(run, path, blend=(), share=0.5, gain=1.0, lead=0.0) -> dict:
 # ------------------------------------------------------------------------------------ join
 
 
+def with_hidden(policy: Policy, hidden) -> Policy:
+    """A policy with another's critic, normaliser and σ; its actor has such hidden layers, whose weights are to be set.
+
+    Test      tests/extras/test_policies.py::test_joined, test_gated"""
+    sizes = policy.obs_size, policy.critic_size, policy.action_size, hidden, policy.value_hidden
+    rng, dtype = np.random.default_rng(0), policy.theta_pi.dtype
+    out = Policy(*sizes, 1.0, policy.value_scale, rng, dtype, policy.activation)
+    out.log_std[:] = policy.log_std
+    out.critic.theta[:] = policy.critic.theta
+    out.norm.load_state(policy.norm.state())
+    return out
+
+
 def joined(one: Policy, other: Policy, inputs, own) -> Policy:
     r"""One network of two: the hidden units of both beside one another, some outputs from those of one, the rest from
     those of the other.
@@ -241,9 +254,7 @@ def joined(one: Policy, other: Policy, inputs, own) -> Policy:
     same = [(len(p.hidden), p.action_size, p.activation) for p in (one, other)]
     if same[0] != same[1]:
         raise ValueError(f"layers, outputs and activation {same[1]}, expected {same[0]}")
-    hidden = tuple(a + b for a, b in zip(one.hidden, other.hidden, strict=True))
-    sizes = one.obs_size, one.critic_size, one.action_size, hidden, one.value_hidden
-    out = Policy(*sizes, 1.0, one.value_scale, np.random.default_rng(0), one.theta_pi.dtype, one.activation)
+    out = with_hidden(one, tuple(a + b for a, b in zip(one.hidden, other.hidden, strict=True)))
     a, b, c = one.actor.params, {k: v.astype(float) for k, v in other.actor.params.items()}, out.actor.params
     inverse, theirs, inputs = one.norm.inv_std.astype(float), other.norm.inv_std.astype(float), np.asarray(inputs)
     k = np.arange(len(inputs))
@@ -258,9 +269,6 @@ def joined(one: Policy, other: Policy, inputs, own) -> Policy:
         c[f"b{i}"][:] = np.concatenate([a[f"b{i}"], b[f"b{i}"]])
     c[f"W{last}"][:] = np.vstack([a[f"W{last}"] * own, b[f"W{last}"] * ~np.asarray(own)])
     c[f"b{last}"][:] = np.where(own, a[f"b{last}"], b[f"b{last}"])
-    out.log_std[:] = one.log_std
-    out.critic.theta[:] = one.critic.theta
-    out.norm.load_state(one.norm.state())
     return out
 
 
@@ -288,8 +296,7 @@ def gated(one: Policy, other: Policy, inputs, moves, speed, width, depth, scale)
         raise ValueError(f"hidden layers {one.hidden} of {one.activation}, expected two of leaky_relu")
     both = joined(one, other, inputs, np.ones(one.action_size, bool))
     (h, k), ours, slope = both.hidden, one.hidden[1], LEAKY_SLOPE
-    sizes = one.obs_size, one.critic_size, one.action_size, (h + 4, k + 2), one.value_hidden
-    out = Policy(*sizes, 1.0, one.value_scale, np.random.default_rng(0), one.theta_pi.dtype, one.activation)
+    out = with_hidden(one, (h + 4, k + 2))
     w = {name: np.zeros(v.shape) for name, v in out.actor.params.items()}
     for name, v in both.actor.params.items():
         w[name][tuple(slice(n) for n in v.shape)] = v
@@ -310,10 +317,20 @@ def gated(one: Policy, other: Policy, inputs, moves, speed, width, depth, scale)
     w["b2"][:] = a["b2"] + lost_b - 0.1 * w["W2"][k:].sum(axis=0)
     for name, v in out.actor.params.items():
         v[:] = w[name]
-    out.log_std[:] = one.log_std
-    out.critic.theta[:] = one.critic.theta
-    out.norm.load_state(one.norm.state())
     return out
+
+
+def motors_of(char: Character, patterns) -> np.ndarray:
+    """(u,) bool: which motors' hinges such patterns name.  UserError: one that no motor fits, or all of them fit
+
+    Test      tests/extras/test_policies.py::test_join_command"""
+    names = [char.hinges[h] for h in char.driven]
+    fits = np.array([[fnmatch(name, pattern) for name in names] for pattern in patterns])
+    own = fits.any(axis=0)
+    if own.all() or not fits.any(axis=1).all():
+        odd = next((m for m, f in zip(patterns, fits) if not f.any()), ",".join(patterns))
+        raise UserError(f"--motors {odd}: {'all' if own.all() else 'none'}; valid: some of {', '.join(names)}")
+    return own
 
 
 def join(out_path, one_path, other_path, opt: Join) -> dict:
@@ -333,12 +350,7 @@ def join(out_path, one_path, other_path, opt: Join) -> dict:
     if not all(bodies) or bodies[0] != bodies[1]:
         raise UserError(f"{other_path}: of the body {bodies[1]}; valid: as {one_path}, {bodies[0]}")
     char = trained_as(meta, one_path).load()
-    names = [char.hinges[h] for h in char.driven]
-    fits = np.array([[fnmatch(name, pattern) for name in names] for pattern in opt.motors]).reshape(-1, len(names))
-    own = fits.any(axis=0)
-    if opt.motors and (own.all() or not own.any() or not fits.any(axis=1).all()):
-        odd = next((m for m, f in zip(opt.motors, fits) if not f.any()), ",".join(opt.motors))
-        raise UserError(f"--motors {odd}: {'all' if own.all() else 'none'}; valid: some of {', '.join(names)}")
+    own = motors_of(char, opt.motors) if opt.motors else None
     for path, m in ((one_path, meta), (other_path, its)):
         if lead := m.get("lead"):  # PPO that goes on unlearns it
             undo = f"python -m extras.policies ship {path} NEW.npz --lead {-lead:g}"
@@ -349,7 +361,7 @@ def join(out_path, one_path, other_path, opt: Join) -> dict:
     inputs, step = [have.index(n) for n in need], (1.0 - ROOT_SHARE) * CONTROL_RATE
     moves = {"user_previous.h.x": step, "user.h.x": -step, "qd.vx": -ROOT_SHARE}  # m/s backwards
     try:
-        if opt.motors:
+        if own is not None:
             policy = joined(one, other, inputs, own)
         else:
             policy = gated(one, other, inputs, {have.index(n): m for n, m in moves.items()}, opt.backwards, **GATE)
