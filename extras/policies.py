@@ -2,7 +2,8 @@ r"""Policies made of policies: shipped, averaged, joined, carried over to anothe
 
     python -m extras.policies ship RUN OUT.npz                         the policy of a run, with its data's licence
     python -m extras.policies blend OUT.npz A B … --share 0.3          A's weights averaged with those of the others
-    python -m extras.policies ship OLD.npz NEW.npz --lead 0.07         is shown its user 0.07 s ahead: is less late
+    python -m extras.policies ship OLD.npz NEW.npz --lead 0.07 --damping 0.1
+                                                                       is shown its user 0.07 s ahead: is less late
     python -m extras.policies join OUT.npz A B --motors 'elbow_*'      one network of two: A's elbows, all else B's
     python -m extras.policies join OUT.npz A B --backwards 0.15        or B where headset and root go backwards
     python -m extras.policies carry OLD.npz NEW.npz --character dino   to go on with as another character, another
@@ -74,28 +75,43 @@ def blended(policy: Policy, others: list[Policy], share: float) -> Policy:
     return policy
 
 
-def led(policy: Policy, char: Character, seconds: float, devices=3) -> Policy:
+def led(policy: Policy, char: Character, seconds: float, devices=3, damping=0.0) -> Policy:
     r"""A policy that is shown its user as far ahead as the headset goes in so many seconds; by its first layer alone.
 
-    Equation  p'_t = p_t + λ v_t, p'_{t-1} = p_{t-1} + λ v_t of every device, v_t = (h_t - h_{t-1}) / Δt, horizontally:
-              o' = o + (λ / Δt) S o is linear in the observation, so W(x(o')) + b is W' x(o) + b'
-    Symbols   λ seconds; h the headset's position; x the normalised observation, of which the clipping is left aside
+    Equation  p'_t = p_t + λ v_t + μ (v_t - v_root), and p'_{t-1} likewise, of every device, v_t = (h_t - h_{t-1}) / Δt,
+              horizontally: o' = o + S o is linear in the observation, so W(x(o')) + b is W' x(o) + b'
+    Symbols   λ seconds, μ damping [s]; h the headset's position, v_root the character's own velocity, in its heading's
+              frame as all of o; x the normalised observation, of which the clipping is left aside
     Why       a policy follows its user 8 to 10 cm late, as the reward hardly tells that from no lateness (Table 2's
               kernel of links is 0.95 at 9 cm): asked to be where the user will be, it is where the user is (measured).
-              It is for policies that are done: PPO that goes on makes them later again, by 1 cm in 2 to 4 M steps
-    Returns   policy, changed
+              That is right while both go as fast.  In turns, starts and stops they do not, and μ tells of it a step
+              before a distance does, as the derivative's part of a PD controller.  It is for policies that are done:
+              by Table 2's kernel PPO that goes on makes them later again, by 1 cm in 2 to 4 M steps
+    Returns   policy, changed; with -λ, -μ what it was
     Test      tests/extras/test_policies.py::test_led
     """
     names, norm, w = input_names(char, devices, False), policy.norm, policy.actor.params
-    inverse, mean = norm.inv_std.astype(float), norm.mean.astype(float)
+    inverse, mean, step = norm.inv_std.astype(float), norm.mean.astype(float), (seconds + damping) * CONTROL_RATE
     for axis in "xy":
-        now, before = (names.index(f"{term}.h.{axis}") for term in ("user", "user_previous"))
+        now, before, root = (names.index(n + axis) for n in ("user.h.", "user_previous.h.", "qd.v"))
         moved = [names.index(f"{t}.{d}.{axis}") for t in ("user", "user_previous") for d in "hlr"[:devices]]
-        answer = seconds * CONTROL_RATE * (inverse[moved] @ w["W0"][moved].astype(float))  # to a metre a step
-        w["W0"][now] += answer / inverse[now]
-        w["W0"][before] -= answer / inverse[before]
-        w["b0"][:] += answer * (mean[now] - mean[before])
+        answer = inverse[moved] @ w["W0"][moved].astype(float)  # of the first layer to a metre
+        for k, metres in ((now, step), (before, -step), (root, -damping)):
+            w["W0"][k] += metres * answer / inverse[k]
+            w["b0"][:] += metres * answer * mean[k]
     return policy
+
+
+def shown_ahead(meta) -> dict:
+    """λ and μ of `led` as a policy's file says, those that are not 0: {"lead": …, "damping": …}.
+
+    Test      tests/extras/test_policies.py::test_led_by_command"""
+    return {k: meta[k] for k in ("lead", "damping") if meta.get(k)}
+
+
+def flags_of(options) -> str:
+    """{"lead": 0.08} -> "--lead 0.08".  Test: tests/extras/test_policies.py::test_join_command"""
+    return " ".join(f"--{k} {v:g}" for k, v in options.items())
 
 
 def parted(changes) -> tuple[list[str], list[str]]:
@@ -170,13 +186,13 @@ def meta_of(path) -> dict:
         return {}
 
 
-def ship(run, path, blend=(), share=0.5, gain=1.0, lead=0.0) -> dict:
+def ship(run, path, blend=(), share=0.5, gain=1.0, lead=0.0, damping=0.0) -> dict:
     """Write a run's policy for others to play: weights, normaliser, how it was trained, its data's licence.
 
     Args      blend : policies to average it with (`blended`), share : of them together
               gain : the normaliser's deviations are divided by it.  Averaging shrinks weights where policies differ,
               and with them the answer to a deviation; a gain of some per cent gives it back (measured)
-              lead : seconds ahead at which it is shown its user (`led`)
+              lead, damping : seconds ahead at which it is shown its user (`led`)
     Returns   what was written beside the weights
     Raises    UserError: the run has no checkpoint, a policy does not fit, or the path cannot be written
     Test      tests/extras/test_policies.py::test_ship, test_blended
@@ -207,12 +223,14 @@ def ship(run, path, blend=(), share=0.5, gain=1.0, lead=0.0) -> dict:
     if experts := pairs_of(meta["options"].get("expert")):  # a policy's name, no folder of this machine
         kept["options"]["expert"] = [f"{pattern}={Path(file).name}" for pattern, file in experts]
     policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})
-    if lead:
-        policy = led(policy, trained_as(meta, run).load(), lead, devices_of(meta, run, None))
-    before = [m.get("lead", 0.0) for m in (meta, *(its for _, its in loaded))]  # in the weights, and averaged with them
-    lead += before[0] if not blend else (1.0 - share) * before[0] + share * float(np.mean(before[1:]))
+    ahead = {"lead": lead, "damping": damping}
+    if any(ahead.values()):
+        policy = led(policy, trained_as(meta, run).load(), lead, devices_of(meta, run, None), damping)
+    for k in ahead:
+        before = [m.get(k, 0.0) for m in (meta, *(its for _, its in loaded))]  # in the weights, and averaged with them
+        ahead[k] += before[0] if not blend else (1.0 - share) * before[0] + share * float(np.mean(before[1:]))
     gain *= meta.get("gain", 1.0)
-    kept |= ({"gain": gain} if gain != 1.0 else {}) | ({"lead": round(lead, 4)} if lead else {})
+    kept |= ({"gain": gain} if gain != 1.0 else {}) | shown_ahead({k: round(v, 4) for k, v in ahead.items()})
     kept |= {k: meta[k] for k in ("carried", "blend", "joined") if k in meta}
     if blend:
         kept["blend"] = {"with": [Path(p).name for p in blend], "share": share}
@@ -352,9 +370,9 @@ def join(out_path, one_path, other_path, opt: Join) -> dict:
     char = trained_as(meta, one_path).load()
     own = motors_of(char, opt.motors) if opt.motors else None
     for path, m in ((one_path, meta), (other_path, its)):
-        if lead := m.get("lead"):  # PPO that goes on unlearns it
-            undo = f"python -m extras.policies ship {path} NEW.npz --lead {-lead:g}"
-            raise UserError(f"{path}: is shown its user {lead:g} s ahead; valid: without, as by {undo}")
+        if ahead := shown_ahead(m):  # PPO that goes on unlearns it
+            undo = f"python -m extras.policies ship {path} NEW.npz {flags_of({k: -v for k, v in ahead.items()})}"
+            raise UserError(f"{path}: is shown its user {ahead.get('lead', 0):g} s ahead; valid: without, as by {undo}")
     have, need = (input_names(char, devices_of(m, p, None), False) for m, p in ((meta, one_path), (its, other_path)))
     if lacking := [n for n in need if n not in have]:
         raise UserError(f"{other_path}: sees {lacking[0]}, which {one_path} does not; valid: in the other order")
@@ -523,9 +541,10 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
         sizes = f"has {policy.critic_size} inputs and {policy.action_size} actions"
         body = f"{old.path} has {len(have)} and {len(outputs)}"
         raise UserError(f"{path}: {sizes}, {body}: give the body it was trained with as --from-character PATH")
-    if (lead := meta.get("lead")) and (sensors != trained or old.name != new.name):
-        policy, meta = led(policy, old, -lead, ways[0][1]), {k: v for k, v in meta.items() if k != "lead"}
-        print(f"{path}: was shown its user {lead:g} s ahead; no longer: ship --lead does it again")
+    if (ahead := shown_ahead(meta)) and (sensors != trained or old.name != new.name):
+        lead, damping = (-ahead.get(k, 0.0) for k in ("lead", "damping"))
+        policy, meta = led(policy, old, lead, ways[0][1], damping), {k: v for k, v in meta.items() if k not in ahead}
+        print(f"{path}: was shown its user {-lead:g} s ahead; no longer: ship {flags_of(ahead)} does it again")
     place = lambda names, name: names.index(name) if name in names else -1  # noqa: E731
     inputs, motors = [place(have, n) for n in need], [place(outputs, n) for n in wanted]
     actor = sum(observation_terms(new, ways[1][1], sees)["actor"].values())
@@ -543,7 +562,7 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
     )
     options = meta.get("options", {}) | {"sensors": sensors, "without": list(opt.without)}
     options |= {"hidden": list(policy.hidden), "value_hidden": list(policy.value_hidden), "init": None, "out": None}
-    kept = {k: meta[k] for k in ("data", "blend", "gain", "lead", "reward") if k in meta}
+    kept = {k: meta[k] for k in ("data", "blend", "gain", "lead", "damping", "reward") if k in meta}
     kept["licence"] = each_once(licences_of(meta, path)) or "MIT"  # what it began from is not named any more
     kept |= {"policy": policy.shape(), "options": options, "steps": total_steps(meta), "carried": Path(path).name}
     return policy, kept | {"versions": versions(), "git": git_state()}
@@ -558,6 +577,7 @@ class Ship:
 
     gain: float = arg(1.0, "makes the policy's standardised observations so many times as large", check=POSITIVE)
     lead: float = arg(0.0, "shows the policy its user so many seconds ahead, by the headset's velocity", check=LEADS)
+    damping: float = arg(0.0, "and so many more, by how much faster than the root the headset goes", check=LEADS)
 
 
 @dataclass

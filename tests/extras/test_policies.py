@@ -175,8 +175,9 @@ def test_blended(tmp_path, capsys):
 
 @pytest.mark.parametrize("devices", (3, 1))
 def test_led(char, ref, devices):
-    """It acts as the old policy does where all devices are ahead by what the headset goes in that time; heights and
-    rotations are as they were, so is the critic, and led back it is the old one."""
+    """It acts as the old policy does where all devices are ahead by what the headset goes in that time, and by what it
+    goes more than the root in the other; heights and rotations are as they were, so is the critic, and led back it is
+    the old one."""
     env = Env(char, headset_only(ref) if devices == 1 else ref, 64, seed=1)
     env.reset(seed=2)
     policy = Policy(env.obs_size, env.critic_size, env.action_size, (16, 8), (8,), 0.1, 1.0, np.random.default_rng(0))
@@ -189,14 +190,15 @@ def test_led(char, ref, devices):
         seen = dict(zip(names, row))
         for k, (term, *rest) in enumerate(name.split(".") for name in names):
             if term.startswith("user") and rest[1] in "xy":
-                shown[k] += 0.07 * 30.0 * (seen[f"user.h.{rest[1]}"] - seen[f"user_previous.h.{rest[1]}"])
+                v = 30.0 * (seen[f"user.h.{rest[1]}"] - seen[f"user_previous.h.{rest[1]}"])
+                shown[k] += 0.07 * v + 0.1 * (v - seen[f"qd.v{rest[1]}"])
     assert np.abs(ahead - obs).max() > 0.02
     expected, before = policy.mean_action(ahead), policy.mean_action(obs)
     assert np.abs(expected - before).max() > 0.05
     critic = policy.critic.theta.copy()
-    np.testing.assert_allclose(policies.led(policy, char, 0.07, devices).mean_action(obs), expected, atol=2e-4)
+    np.testing.assert_allclose(policies.led(policy, char, 0.07, devices, 0.1).mean_action(obs), expected, atol=2e-4)
     np.testing.assert_array_equal(policy.critic.theta, critic)
-    np.testing.assert_allclose(policies.led(policy, char, -0.07, devices).mean_action(obs), before, atol=2e-4)
+    np.testing.assert_allclose(policies.led(policy, char, -0.07, devices, -0.1).mean_action(obs), before, atol=2e-4)
 
 
 def test_nothing_is_overwritten(whole, tmp_path):  # noqa: F811
@@ -225,30 +227,32 @@ def test_ancestry_is_kept(whole, tmp_path):  # noqa: F811
 def test_carried_without_its_lead(whole, tmp_path, char, capsys):  # noqa: F811
     """Carried to another character or to the headset alone, a led policy is what it was before its lead."""
     led, files = str(tmp_path / "led.npz"), [str(tmp_path / f"{n}.npz") for n in "abcdef"]
-    policies.main(["ship", str(whole), led, "--lead", "0.08"])
+    policies.main(["ship", str(whole), led, "--lead", "0.08", "--damping", "0.1"])
     for k, flags in enumerate((["--sensors", "hmd"], ["--character", "dino"], ["--hidden", "40"])):
         for old, new in zip((str(whole), led), files[2 * k : 2 * k + 2], strict=True):
             policies.main(["carry", old, new, *flags])
         (plain, _), (other, meta) = load_policy(files[2 * k]), load_policy(files[2 * k + 1])
         close = np.allclose(plain.actor.params["W0"], other.actor.params["W0"], atol=1e-5)
-        assert close is (k < 2) and ("lead" in meta) is (k == 2)
-    assert capsys.readouterr().out.count("was shown its user 0.08 s ahead; no longer") == 2
+        assert close is (k < 2) and ("lead" in meta) is ("damping" in meta) is (k == 2)
+    assert capsys.readouterr().out.count("0.08 s ahead; no longer: ship --lead 0.08 --damping 0.1") == 2
 
 
 def test_led_by_command(whole, tmp_path, capsys):  # noqa: F811
     """`ship --lead` says in the file how far ahead, and adds to what was there; averages and copies keep it."""
     once, twice = tmp_path / "once.npz", tmp_path / "twice.npz"
     policies.main(["ship", str(whole), str(once), "--lead", "0.05"])
-    policies.main(["ship", str(once), str(twice), "--lead", "0.02"])
+    policies.main(["ship", str(once), str(twice), "--lead", "0.02", "--damping", "0.1"])
     told = lambda *paths: [load_policy(p)[1].get("lead", 0.0) for p in paths]  # noqa: E731
     assert told(once, twice) == [0.05, 0.07]
+    assert policies.shown_ahead(load_policy(twice)[1]) == {"lead": 0.07, "damping": 0.1}
     policies.ship(once, tmp_path / "copy.npz")
     policies.ship(once, tmp_path / "mean.npz", [whole, twice], share=0.4)
     policies.ship(whole, tmp_path / "none.npz", [whole])
     assert told(*(tmp_path / f"{n}.npz" for n in ("copy", "mean", "none"))) == [0.05, 0.044, 0.0]
     policy, meta = load_policy(whole)
     char = trained_as(meta, whole).load()
-    np.testing.assert_allclose(load_policy(twice)[0].theta_pi, policies.led(policy, char, 0.07).theta_pi, atol=1e-5)
+    asked = policies.led(policy, char, 0.07, damping=0.1)
+    np.testing.assert_allclose(load_policy(twice)[0].theta_pi, asked.theta_pi, atol=1e-5)
     with pytest.raises(SystemExit):
         policies.main(["ship", str(whole), str(once), "--lead", "2"])
     assert "from -0.5 to 0.5 s" in capsys.readouterr().err
@@ -340,13 +344,13 @@ def test_join_command(whole, tmp_path, char, capsys):  # noqa: F811
     assert train(tmp_path / "more", 1, "--init", out, "--hidden", hidden)[1]["before"] == meta["steps"]
 
     led, new = str(tmp_path / "led.npz"), str(tmp_path / "new.npz")
-    policies.main(["ship", str(whole), led, "--lead", "0.05"])
+    policies.main(["ship", str(whole), led, "--lead", "0.05", "--damping", "0.1"])
     for files, flags, line in (
         ([hmd, str(whole)], arms, "sees user_previous.l.x, which .*hmd.npz does not"),
         ([str(whole), hmd], ["--motors", "wing_*"], "--motors wing_.: none; valid: some of hip_l_y"),
         ([str(whole), hmd], ["--motors", "elbow_*,wing_*"], "--motors wing_.: none; valid"),
         ([str(whole), hmd], ["--motors", "*"], "--motors .: all; valid"),
-        ([led, hmd], arms, "shown its user 0.05 s ahead; valid: .*--lead -0.05"),
+        ([led, hmd], arms, "shown its user 0.05 s ahead; valid: .*--lead -0.05 --damping -0.1"),
         ([str(whole), hmd], [], "valid: one of --motors and --backwards"),
         ([str(whole), hmd], [*arms, "--backwards", "0.2"], "valid: one of --motors and --backwards"),
     ):
