@@ -3,7 +3,8 @@ r"""Policies made of policies: shipped, averaged, joined, carried over to anothe
     python -m extras.policies ship RUN OUT.npz                         the policy of a run, with its data's licence
     python -m extras.policies blend OUT.npz A B … --share 0.3          A's weights averaged with those of the others
     python -m extras.policies ship OLD.npz NEW.npz --lead 0.07 --damping 0.1
-                                                                       is shown its user 0.07 s ahead: is less late
+                                                                       is shown its user ahead, farther where the user
+                                                                       is faster than it: is less late
     python -m extras.policies join OUT.npz A B --motors 'elbow_*'      one network of two: A's elbows, all else B's
     python -m extras.policies join OUT.npz A B --backwards 0.15        or B where headset and root go backwards
     python -m extras.policies carry OLD.npz NEW.npz --character dino   to go on with as another character, another
@@ -78,16 +79,17 @@ def blended(policy: Policy, others: list[Policy], share: float) -> Policy:
 def led(policy: Policy, char: Character, seconds: float, devices=3, damping=0.0) -> Policy:
     r"""A policy that is shown its user as far ahead as the headset goes in so many seconds; by its first layer alone.
 
-    Equation  p'_t = p_t + λ v_t + μ (v_t - v_root), and p'_{t-1} likewise, of every device, v_t = (h_t - h_{t-1}) / Δt,
-              horizontally: o' = o + S o is linear in the observation, so W(x(o')) + b is W' x(o) + b'
-    Symbols   λ seconds, μ damping [s]; h the headset's position, v_root the character's own velocity, in its heading's
-              frame as all of o; x the normalised observation, of which the clipping is left aside
-    Why       a policy follows its user 8 to 10 cm late, as the reward hardly tells that from no lateness (Table 2's
-              kernel of links is 0.95 at 9 cm): asked to be where the user will be, it is where the user is (measured).
-              That is right while both go as fast.  In turns, starts and stops they do not, and μ tells of it a step
-              before a distance does, as the derivative's part of a PD controller.  It is for policies that are done:
-              by Table 2's kernel PPO that goes on makes them later again, by 1 cm in 2 to 4 M steps
-    Returns   policy, changed; with -λ, -μ what it was
+    Equation  p'_t = p_t + d, p'_{t-1} = p_{t-1} + d of every device, d = λ v_t + μ (v_t - v_root), horizontally,
+              v_t = (h_t - h_{t-1}) / Δt: o' = o + S o is linear in the observation, so W(x(o')) + b is W' x(o) + b';
+              d has none of itself in it, S² = 0, so -λ, -μ is the inverse
+    Symbols   λ seconds, μ damping [s]; h the headset's position, v_root the root's linear velocity at t, in its
+              heading's frame as all of o; x the normalised observation, of which the clipping is left aside
+    Why       a policy trained by Table 2's kernel of links, 0.95 at 9 cm, follows its user 8 to 10 cm late: asked to
+              be where the user will be, it is where the user is (measured).  That is right while both go as fast.  In
+              turns, starts and stops they do not, and μ tells of it a step before a distance does, as the derivative's
+              part of a PD controller.  PPO that goes on by that kernel takes it back, 1 cm in 2 to 4 M steps; by a
+              sharper one it keeps it (RESULTS.md)
+    Returns   policy, changed
     Test      tests/extras/test_policies.py::test_led
     """
     names, norm, w = input_names(char, devices, False), policy.norm, policy.actor.params
@@ -192,7 +194,7 @@ def ship(run, path, blend=(), share=0.5, gain=1.0, lead=0.0, damping=0.0) -> dic
     Args      blend : policies to average it with (`blended`), share : of them together
               gain : the normaliser's deviations are divided by it.  Averaging shrinks weights where policies differ,
               and with them the answer to a deviation; a gain of some per cent gives it back (measured)
-              lead, damping : seconds ahead at which it is shown its user (`led`)
+              lead, damping : λ, μ of `led` [s]
     Returns   what was written beside the weights
     Raises    UserError: the run has no checkpoint, a policy does not fit, or the path cannot be written
     Test      tests/extras/test_policies.py::test_ship, test_blended
@@ -370,9 +372,9 @@ def join(out_path, one_path, other_path, opt: Join) -> dict:
     char = trained_as(meta, one_path).load()
     own = motors_of(char, opt.motors) if opt.motors else None
     for path, m in ((one_path, meta), (other_path, its)):
-        if ahead := shown_ahead(m):  # PPO that goes on unlearns it
+        if ahead := shown_ahead(m):  # PPO that goes on by Table 2's kernel unlearns it
             undo = f"python -m extras.policies ship {path} NEW.npz {flags_of({k: -v for k, v in ahead.items()})}"
-            raise UserError(f"{path}: is shown its user {ahead.get('lead', 0):g} s ahead; valid: without, as by {undo}")
+            raise UserError(f"{path}: is shown its user ahead, {flags_of(ahead)}; valid: without, as by {undo}")
     have, need = (input_names(char, devices_of(m, p, None), False) for m, p in ((meta, one_path), (its, other_path)))
     if lacking := [n for n in need if n not in have]:
         raise UserError(f"{other_path}: sees {lacking[0]}, which {one_path} does not; valid: in the other order")
@@ -544,7 +546,7 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
     if (ahead := shown_ahead(meta)) and (sensors != trained or old.name != new.name):
         lead, damping = (-ahead.get(k, 0.0) for k in ("lead", "damping"))
         policy, meta = led(policy, old, lead, ways[0][1], damping), {k: v for k, v in meta.items() if k not in ahead}
-        print(f"{path}: was shown its user {-lead:g} s ahead; no longer: ship {flags_of(ahead)} does it again")
+        print(f"{path}: was shown its user ahead; no longer: ship {flags_of(ahead)} does it again")
     place = lambda names, name: names.index(name) if name in names else -1  # noqa: E731
     inputs, motors = [place(have, n) for n in need], [place(outputs, n) for n in wanted]
     actor = sum(observation_terms(new, ways[1][1], sees)["actor"].values())
@@ -577,7 +579,7 @@ class Ship:
 
     gain: float = arg(1.0, "makes the policy's standardised observations so many times as large", check=POSITIVE)
     lead: float = arg(0.0, "shows the policy its user so many seconds ahead, by the headset's velocity", check=LEADS)
-    damping: float = arg(0.0, "and so many more, by how much faster than the root the headset goes", check=LEADS)
+    damping: float = arg(0.0, "and by so many seconds times (headset's velocity - root's)", check=LEADS)
 
 
 @dataclass

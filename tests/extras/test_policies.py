@@ -234,7 +234,7 @@ def test_carried_without_its_lead(whole, tmp_path, char, capsys):  # noqa: F811
         (plain, _), (other, meta) = load_policy(files[2 * k]), load_policy(files[2 * k + 1])
         close = np.allclose(plain.actor.params["W0"], other.actor.params["W0"], atol=1e-5)
         assert close is (k < 2) and ("lead" in meta) is ("damping" in meta) is (k == 2)
-    assert capsys.readouterr().out.count("0.08 s ahead; no longer: ship --lead 0.08 --damping 0.1") == 2
+    assert capsys.readouterr().out.count("ahead; no longer: ship --lead 0.08 --damping 0.1 does") == 2
 
 
 def test_led_by_command(whole, tmp_path, capsys):  # noqa: F811
@@ -343,14 +343,16 @@ def test_join_command(whole, tmp_path, char, capsys):  # noqa: F811
     hidden = ",".join(map(str, both.hidden))
     assert train(tmp_path / "more", 1, "--init", out, "--hidden", hidden)[1]["before"] == meta["steps"]
 
-    led, new = str(tmp_path / "led.npz"), str(tmp_path / "new.npz")
+    led, damped, new = (str(tmp_path / f"{n}.npz") for n in ("led", "damped", "new"))
     policies.main(["ship", str(whole), led, "--lead", "0.05", "--damping", "0.1"])
+    policies.main(["ship", str(whole), damped, "--damping", "0.1"])
     for files, flags, line in (
         ([hmd, str(whole)], arms, "sees user_previous.l.x, which .*hmd.npz does not"),
         ([str(whole), hmd], ["--motors", "wing_*"], "--motors wing_.: none; valid: some of hip_l_y"),
         ([str(whole), hmd], ["--motors", "elbow_*,wing_*"], "--motors wing_.: none; valid"),
         ([str(whole), hmd], ["--motors", "*"], "--motors .: all; valid"),
-        ([led, hmd], arms, "shown its user 0.05 s ahead; valid: .*--lead -0.05 --damping -0.1"),
+        ([led, hmd], arms, "ahead, --lead 0.05 --damping 0.1; valid: .*--lead -0.05 --damping -0.1"),
+        ([damped, hmd], arms, "ahead, --damping 0.1; valid: .*NEW.npz --damping -0.1"),
         ([str(whole), hmd], [], "valid: one of --motors and --backwards"),
         ([str(whole), hmd], [*arms, "--backwards", "0.2"], "valid: one of --motors and --backwards"),
     ):
