@@ -76,13 +76,13 @@ def blended(policy: Policy, others: list[Policy], share: float) -> Policy:
     return policy
 
 
-def led(policy: Policy, char: Character, seconds: float, devices=3, damping=0.0) -> Policy:
+def led(policy: Policy, char: Character, devices=3, *, lead=0.0, damping=0.0) -> Policy:
     r"""A policy that is shown its user as far ahead as the headset goes in so many seconds; by its first layer alone.
 
     Equation  p'_t = p_t + d, p'_{t-1} = p_{t-1} + d of every device, d = λ v_t + μ (v_t - v_root), horizontally,
               v_t = (h_t - h_{t-1}) / Δt: o' = o + S o is linear in the observation, so W(x(o')) + b is W' x(o) + b';
               d has none of itself in it, S² = 0, so -λ, -μ is the inverse
-    Symbols   λ seconds, μ damping [s]; h the headset's position, v_root the root's linear velocity at t, in its
+    Symbols   λ lead, μ damping [s]; h the headset's position, v_root the root's linear velocity at t, in its
               heading's frame as all of o; x the normalised observation, of which the clipping is left aside
     Why       a policy trained by Table 2's kernel of links, 0.95 at 9 cm, follows its user 8 to 10 cm late: asked to
               be where the user will be, it is where the user is (measured).  That is right while both go as fast.  In
@@ -93,7 +93,7 @@ def led(policy: Policy, char: Character, seconds: float, devices=3, damping=0.0)
     Test      tests/extras/test_policies.py::test_led
     """
     names, norm, w = input_names(char, devices, False), policy.norm, policy.actor.params
-    inverse, mean, step = norm.inv_std.astype(float), norm.mean.astype(float), (seconds + damping) * CONTROL_RATE
+    inverse, mean, step = norm.inv_std.astype(float), norm.mean.astype(float), (lead + damping) * CONTROL_RATE
     for axis in "xy":
         now, before, root = (names.index(n + axis) for n in ("user.h.", "user_previous.h.", "qd.v"))
         moved = [names.index(f"{t}.{d}.{axis}") for t in ("user", "user_previous") for d in "hlr"[:devices]]
@@ -227,7 +227,7 @@ def ship(run, path, blend=(), share=0.5, gain=1.0, lead=0.0, damping=0.0) -> dic
     policy.norm.load_state(policy.norm.state() | {"m2": policy.norm.m2 / gain**2})
     ahead = {"lead": lead, "damping": damping}
     if any(ahead.values()):
-        policy = led(policy, trained_as(meta, run).load(), lead, devices_of(meta, run, None), damping)
+        policy = led(policy, trained_as(meta, run).load(), devices_of(meta, run, None), **ahead)
     for k in ahead:
         before = [m.get(k, 0.0) for m in (meta, *(its for _, its in loaded))]  # in the weights, and averaged with them
         ahead[k] += before[0] if not blend else (1.0 - share) * before[0] + share * float(np.mean(before[1:]))
@@ -544,8 +544,8 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
         body = f"{old.path} has {len(have)} and {len(outputs)}"
         raise UserError(f"{path}: {sizes}, {body}: give the body it was trained with as --from-character PATH")
     if (ahead := shown_ahead(meta)) and (sensors != trained or old.name != new.name):
-        lead, damping = (-ahead.get(k, 0.0) for k in ("lead", "damping"))
-        policy, meta = led(policy, old, lead, ways[0][1], damping), {k: v for k, v in meta.items() if k not in ahead}
+        policy = led(policy, old, ways[0][1], **{k: -v for k, v in ahead.items()})
+        meta = {k: v for k, v in meta.items() if k not in ahead}
         print(f"{path}: was shown its user ahead; no longer: ship {flags_of(ahead)} does it again")
     place = lambda names, name: names.index(name) if name in names else -1  # noqa: E731
     inputs, motors = [place(have, n) for n in need], [place(outputs, n) for n in wanted]
@@ -564,7 +564,7 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
     )
     options = meta.get("options", {}) | {"sensors": sensors, "without": list(opt.without)}
     options |= {"hidden": list(policy.hidden), "value_hidden": list(policy.value_hidden), "init": None, "out": None}
-    kept = {k: meta[k] for k in ("data", "blend", "gain", "lead", "damping", "reward") if k in meta}
+    kept = {k: meta[k] for k in ("data", "blend", "gain", "reward") if k in meta} | shown_ahead(meta)
     kept["licence"] = each_once(licences_of(meta, path)) or "MIT"  # what it began from is not named any more
     kept |= {"policy": policy.shape(), "options": options, "steps": total_steps(meta), "carried": Path(path).name}
     return policy, kept | {"versions": versions(), "git": git_state()}

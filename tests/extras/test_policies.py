@@ -195,10 +195,10 @@ def test_led(char, ref, devices):
     assert np.abs(ahead - obs).max() > 0.02
     expected, before = policy.mean_action(ahead), policy.mean_action(obs)
     assert np.abs(expected - before).max() > 0.05
-    critic = policy.critic.theta.copy()
-    np.testing.assert_allclose(policies.led(policy, char, 0.07, devices, 0.1).mean_action(obs), expected, atol=2e-4)
+    critic, ahead_by = policy.critic.theta.copy(), lambda sign: {"lead": sign * 0.07, "damping": sign * 0.1}
+    np.testing.assert_allclose(policies.led(policy, char, devices, **ahead_by(1)).mean_action(obs), expected, atol=2e-4)
     np.testing.assert_array_equal(policy.critic.theta, critic)
-    np.testing.assert_allclose(policies.led(policy, char, -0.07, devices, -0.1).mean_action(obs), before, atol=2e-4)
+    np.testing.assert_allclose(policies.led(policy, char, devices, **ahead_by(-1)).mean_action(obs), before, atol=2e-4)
 
 
 def test_nothing_is_overwritten(whole, tmp_path):  # noqa: F811
@@ -251,7 +251,7 @@ def test_led_by_command(whole, tmp_path, capsys):  # noqa: F811
     assert told(*(tmp_path / f"{n}.npz" for n in ("copy", "mean", "none"))) == [0.05, 0.044, 0.0]
     policy, meta = load_policy(whole)
     char = trained_as(meta, whole).load()
-    asked = policies.led(policy, char, 0.07, damping=0.1)
+    asked = policies.led(policy, char, lead=0.07, damping=0.1)
     np.testing.assert_allclose(load_policy(twice)[0].theta_pi, asked.theta_pi, atol=1e-5)
     with pytest.raises(SystemExit):
         policies.main(["ship", str(whole), str(once), "--lead", "2"])
