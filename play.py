@@ -332,8 +332,7 @@ def figure_options(opt: Options, argv) -> Options:
         raise UserError(f"--figure {opt.figure}: has its own policies, streamed: leave out --{', --'.join(wrong)}")
     paths = [Path(os.path.relpath(CHARACTERS / f"{name}.npz")) for name in FIGURES[opt.figure]]
     if gone := [p for p in paths if not p.is_file()]:
-        make = f"python -m extras.arms run {gone[0].stem}, then python -m extras.arms ship"
-        raise UserError(f"--figure {opt.figure}: no policy {gone[0]}; train one: {make}")
+        raise UserError(f"--figure {opt.figure}: no policy {gone[0]}; the repository has it: git checkout {gone[0]}")
     clips = opt.clips if given & {"motion", "clips"} else USER
     png = opt.png or (None if opt.video else f"figure-{opt.figure}.png")
     return replace(opt, compare=tuple(map(str, paths)), rows=("streamed",), clips=clips, png=png)
@@ -349,7 +348,8 @@ def play_figure(opt: Options) -> None:
     render.check_video(opt.video)
     _, long = metrics.motion_of(opt)
     clip = chosen(long, opt)
-    clip = looking(clip) if opt.figure in LOOKS and opt.clips == USER else clip
+    if opt.figure in LOOKS and opt.clips == USER:
+        clip = replace(looking(clip), name=f"{clip.name}, looks about")
     arms, columns = metrics.arms_of([clip], opt), [c for c in metrics.COLUMNS if c[0] in OF_FIGURE]
     rows = {a.path: metrics.streamed(a.char, a.policy.mean_action, [clip], a.devices, opt.threads) for a in arms}
     print(*(a.title() for a in arms), "streamed", metrics.comparison(rows, columns), sep="\n")

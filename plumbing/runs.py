@@ -248,7 +248,7 @@ def load_checkpoint(path, finite=()):
     Raises    UserError: missing, cut short, not a checkpoint, object arrays, or non-finite numbers
     Test      tests/plumbing/test_runs.py::test_checkpoint_round_trip, test_damaged_checkpoints
     """
-    expected = f"expected an .npz file that save_checkpoint wrote (such as {CHECKPOINT} in a run folder)"
+    expected = f"expected a policy (.npz), or {CHECKPOINT} of a run folder, as training writes them"
     if not Path(path).is_file():
         raise UserError(f"no checkpoint {path}: {expected}")
     arrays = read_arrays(path, expected)
