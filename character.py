@@ -122,8 +122,8 @@ class Switches:
         "tail [§5.1]: active (as the MJCF drives it), fixed (joints without a motor welded), passive (without motors)",
         choices=TAILS,
     )
-    scale: float = arg(
-        1.0, "size of the character [Fig. 5]: masses by its cube, torques by its fourth power", check=POSITIVE
+    scale: float | None = arg(
+        None, "size of the character [Fig. 5], 1: masses by its cube, torques by its fourth power", check=POSITIVE
     )
     set: str | None = arg(
         None, "entries of the TOML to change, as in 'reward.contact=[0, 1]; pose.spine_y=0.3'", metavar="T.K=V;…"
@@ -131,7 +131,7 @@ class Switches:
 
     def load(self) -> Character:
         """The character that the flags describe.  Test: tests/test_characters.py::test_switches"""
-        return load(self.character, self.tail, self.scale, tuple(filter(str.strip, (self.set or "").split(";"))))
+        return load(self.character, self.tail, self.scale or 1.0, tuple(filter(str.strip, (self.set or "").split(";"))))
 
 
 def available() -> list[str]:

@@ -6,7 +6,7 @@ r"""The environment: N characters, each driven by a headset and two controllers 
                  §3.3             and what only the critic sees: the human's full pose, now and in the future
     kernel       Eq. 8            a term of the reward, of the distances of Eqs. 9 to 11; Table 2: characters/NAME.toml
     ablated      §3.5.1, §4.3     the same with less reward; `headset_only` (§4.2) and `asymmetric` (§5.3): less to see
-    Uniform      §3.6             where episodes start; another object with its three methods may stand in its place
+    Uniform      §3.6             where episodes start; another object with its methods and `owner` may stand in
     Env          §3.6, §3.7       reset and step as Gymnasium's vector environments have them
 
 After a physics step MuJoCo's positions, velocities and contacts still belong to the state before the last substep;

@@ -46,7 +46,7 @@ HALVES = {"both": slice(None), "select": slice(0, None, 2), "report": slice(1, N
 class Recording:
     """What a character did on one sequence.
 
-    frames : (T,) reference frames, the start included; qpos (T, nq); contact (T, 2) bool, the human's at the start;
+    frames : (T,) reference frames, the start included; qpos (T, nq); contact (T, 2) bool, not used at the start;
     action (T, u), of the step that led to the frame (zero at the start); failed : bool; available : steps the
     sequence had to offer
     """
@@ -465,7 +465,7 @@ def simulate(
         _, _, terminated, truncated, _ = env.step(act(env))
         qpos.append(env.qpos.copy()), contact.append(env.contact.copy()), action.append(env.action.copy())
         failed |= alive & terminated
-        lived += alive & ~terminated & (env.steps <= available)  # a single frame has no step to offer
+        lived += alive & ~terminated
         alive &= ~(terminated | truncated)
     qpos, contact, action = np.stack(qpos, 1), np.stack(contact, 1), np.stack(action, 1)
     return [
@@ -619,6 +619,8 @@ def motion_of(opt: Options) -> tuple[list, list]:
         raise UserError(f"--rows {','.join(sorted(wrong))}: unknown; valid: {', '.join(ROWS)}")
     single, split = captures_of(opt), "all" if opt.all else opt.split
     long = mocap.data.sequences(opt.motion, split, opt.clips, seed=opt.seed, reading=Reading.of(opt))
+    if not (long := [c for c in long if len(c) > 1]):
+        raise UserError(f"{opt.motion}: a single frame; valid: motion, of two frames or more")
     return single, [resize(c, opt.user_scale) for c in long] if opt.user_scale != 1.0 else long
 
 
@@ -744,10 +746,15 @@ def compare(arms: list[Arm], opt: Options, captures=()) -> dict:
     return out
 
 
-def check_comparison(opt: Options) -> None:
-    """UserError: not several policies.  Test: tests/test_play.py::test_compare"""
+def check_comparison(opt: Options, *others) -> None:
+    """UserError: not several policies, or flags that would do nothing.  Test: tests/test_play.py::test_compare"""
     if len(opt.compare) < 2 or len(set(opt.compare)) < len(opt.compare):
         raise UserError(f"--compare {' '.join(opt.compare)}: valid: two policies or more, none twice")
+    plain, others = type(opt)(), ("policy", "character", "tail", "scale", "set", "push", *others)
+    if wrong := [f"--{k}" for k in others if getattr(opt, k) != getattr(plain, k)]:
+        raise UserError(f"--compare takes policies with their own characters: leave out {', '.join(wrong)}")
+    if opt.rows != plain.rows and (wrong := [r for r in opt.rows if r in ("zero", "pd")]):
+        raise UserError(f"--compare --rows {','.join(wrong)}: is of no policy; valid: streamed, tracked, kinematic")
 
 
 def run_comparison(opt: Options) -> tuple[list[Arm], list]:

@@ -41,7 +41,7 @@ from headset.axes import StreamFlags
 from headset.bsor import opened
 from headset.player import Pace, Player, drive, ride, stream_of, tally
 from headset.reader import DEVICES, GAP, arriving, files_of, is_live, sound
-from human import heading, sensors
+from human import heading
 from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_action, simulate
 from mocap.augment import looking, resize
 from mocap.data import CONTROL_RATE
@@ -107,7 +107,7 @@ def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320), numbe
     from plumbing import render
 
     rate, first = arms[0].ref.rate, int(arms[0].ref.first[opt.sequence])
-    tracked = "tracked" in opt.rows
+    tracked, user = "tracked" in opt.rows, clip
     if not tracked:  # the human where the stream has them, lead-in and all
         clip = stream_of(arms[0].char, clip)[2]
     last = min(len(clip) - 1, EPISODE_STEPS, round((opt.seconds or 10.0) * rate))
@@ -121,7 +121,7 @@ def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320), numbe
     human = retarget.draw(arms[0].char, clip, pose, frames, size, wide, beside)
     rows, view = [(f"human and kinematic {name_of(arms[0].char)}: {clip.name}", human, times)], same_view(arms)
     for a in arms:
-        recording, seen = played(a, clip, opt)
+        recording, seen = played(a, user, opt)
         lived = [t for t in frames if t < len(recording.frames)]
         gone = len(frames) - len(lived)
         images = pictures(a.char, seen, recording, lived, size, camera=view)
@@ -151,13 +151,12 @@ def lines_of(text, width):
 def played(arm: Arm, clip, opt: Options):
     """What a policy did on the sequence that is shown, until it failed, and what it was shown of the user.
 
-    Args      clip : as `headset.player.stream_of` has it, where the policies are streamed
+    Args      clip : the user's, as it was recorded
     Test      tests/test_play.py::test_comparison_sheet_streamed"""
     if "tracked" in opt.rows:
         act = policy_action(arm.policy)
         return simulate(arm.char, arm.seen, act, threads=opt.threads, only=[opt.sequence])[0], arm.seen
-    pos, quat = sensors(clip)
-    pos = pos * retarget.sensor_scale(arm.char, clip.hip_height, clip.measured)
+    pos, quat, _, _ = stream_of(arm.char, clip, arm.devices, opt.sensors == "hmd" and arm.devices == 3)
     [r] = ride(arm.char, arm.policy.mean_action, [(pos, quat)], arm.devices, opt.threads)
     lived = r.lives[0][1]
     seen = SimpleNamespace(sensor_pos=pos[:, : arm.devices], sensor_quat=quat[:, : arm.devices])
@@ -371,10 +370,10 @@ def film(arms: list[Arm], clip, opt: Options, numbers, size=(480, 480)):
     Test      tests/test_play.py::test_figure"""
     from plumbing import render
 
-    clip = stream_of(arms[0].char, clip)[2]
+    user, clip = clip, stream_of(arms[0].char, clip)[2]
     last, films = min(len(clip) - 1, EPISODE_STEPS, round((opt.seconds or 10.0) * CONTROL_RATE)), []
     for a in arms:
-        recording, seen = played(a, clip, opt)
+        recording, seen = played(a, user, opt)
         lived = range(min(last + 1, len(recording.frames)))
         films.append(pictures(a.char, seen, recording, lived, size, True, same_view(arms)))
     under = [np.vstack(lines_of(numbers[a.path], size[0])) for a in arms]
@@ -661,10 +660,7 @@ def check_options(opt: Options, argv) -> None:
             "--stream FILE"
         )
     if opt.compare:
-        metrics.check_comparison(opt)
-        plain, others = Options(), "policy character tail scale set stream view video bvh push".split()
-        if wrong := [f"--{k}" for k in others if getattr(opt, k) != getattr(plain, k)]:
-            raise UserError(f"--compare takes policies with their own characters: leave out {', '.join(wrong)}")
+        metrics.check_comparison(opt, "stream", "view", "video", "bvh")
     check_source(opt, argv)
     check_given(opt, given_flags(argv))
     opt.check_bvh()

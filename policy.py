@@ -20,6 +20,7 @@ from nn import ACTIVATIONS, MLP, RunningNorm
 from plumbing.cli import UserError
 from plumbing.runs import CHECKPOINT, latest_checkpoint, load_checkpoint
 
+STUB = (8, 8)  # hidden layers of the critic in a file that is only to be watched (`extras.arms.ship`): nothing asks it
 WEIGHT_LIMIT, NORM_LIMIT = 1e6, 1e30  # no weight of a policy, no sum of its normaliser is larger: float32 stays finite
 
 
@@ -191,10 +192,17 @@ def misfit(path, character, odd) -> UserError:
 def initial(path, opt, env) -> tuple[Policy, int]:
     """A policy to go on from, and the steps that it has seen: no σ below the run's, V in the environment's scale.
 
-    Args      opt : of the run (`check_exact`), with gamma and min_sigma
+    A file that is only to be watched has a stub of a critic; the run begins with a new one.
+    Args      opt : of the run (`check_exact`), with gamma, min_sigma and seed
     Raises    UserError: of another character, or other sizes
-    Test      tests/test_ppo.py::test_init_fine_tunes"""
+    Test      tests/test_ppo.py::test_init_fine_tunes, tests/extras/test_arms.py::test_ship"""
     policy, meta = load_policy(path)
+    if policy.value_hidden == STUB != tuple(opt.value_hidden):
+        shape = policy.shape() | {"value_hidden": opt.value_hidden}
+        whole = Policy(sigma=1.0, rng=np.random.default_rng([opt.seed, 2]), **shape)
+        whole.load(policy.arrays() | {"policy.critic": whole.critic.theta})
+        policy = whole
+        print(f"{path}: has no critic, to be small; begins with a new one")
     check_exact(policy, meta, path, opt, env)
     policy.norm.frozen, policy.value_scale = False, env.value_scale(opt.gamma)
     np.maximum(policy.log_std, np.log(opt.min_sigma), out=policy.log_std)
@@ -202,14 +210,15 @@ def initial(path, opt, env) -> tuple[Policy, int]:
 
 
 def widths(path, character) -> dict:
-    """The hidden layers of a policy's two networks, by the names of the options.
+    """The hidden layers of a policy's two networks, by the names of the options; not those of a stub.
 
     Raises    UserError: it is another character's, which is said here, before motions are read
     Test      tests/test_ppo.py::test_init_brings_its_widths, test_init_points_to_carry"""
     policy, meta = load_policy(path)
     if odd := anothers(meta, path, character):
         raise misfit(path, character, odd)
-    return {"hidden": policy.hidden, "value_hidden": policy.value_hidden}
+    own = {"hidden": policy.hidden, "value_hidden": policy.value_hidden}
+    return {k: v for k, v in own.items() if v != STUB or k == "hidden"}
 
 
 def trained_as(meta, path) -> Switches | None:
@@ -221,6 +230,7 @@ def trained_as(meta, path) -> Switches | None:
     if not isinstance(options, dict) or "character" not in options:
         return None
     found = {f.name: options.get(f.name, f.default) for f in fields(Switches)}
+    found["scale"] = 1.0 if found["scale"] is None else found["scale"]
     texts = [found["character"], found["tail"] or "", found["set"] or ""]
     if not all(isinstance(t, str) for t in texts) or type(found["scale"]) not in (int, float) or not found["scale"] > 0:
         raise UserError(f"{path}: its options name no character: {str(found)[:200]}; valid: what ppo.py wrote")

@@ -46,7 +46,7 @@ from plumbing.cli import (
     words_first,
 )
 from plumbing.files import atomic_write, check_folders
-from policy import Policy, check_fits, load_policy, trained_as
+from policy import STUB, Policy, check_fits, load_policy, trained_as
 from retarget import Reference, reference
 
 # ASSUMED: half of ppo.py's batch, so that a million steps are 244 updates.  σ starts at the default 0.135: from scratch
@@ -358,8 +358,6 @@ def curves(opt: Options) -> None:
 
 # ------------------------------------------------------------------------------------ ship
 
-STUB = (8, 8)  # hidden layers of a shipped critic
-
 
 def ship(run, path) -> dict:
     """`extras.policies.ship` of a policy to watch: its critic is a stub, which halves the file.
@@ -368,8 +366,6 @@ def ship(run, path) -> dict:
     Test      tests/extras/test_arms.py::test_ship"""
     meta = policies.ship(run, path)
     policy, _ = load_policy(path)
-    _, before = load_policy(run)
-    meta |= {k: before[k] for k in ("carried",) if k in before}  # from which policy, where it was not trained since
     shape = policy.shape() | {"value_hidden": STUB}
     light = Policy(sigma=1.0, rng=np.random.default_rng(0), **shape)
     light.load(policy.arrays() | {"policy.critic": light.critic.theta})

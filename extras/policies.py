@@ -387,7 +387,7 @@ def join(out_path, one_path, other_path, opt: Join) -> dict:
             policy = gated(one, other, inputs, {have.index(n): m for n, m in moves.items()}, opt.backwards, **GATE)
     except ValueError as e:
         raise UserError(f"join {one_path} {other_path}: {e}; valid: networks of as many layers") from None
-    kept = {k: meta[k] for k in ("data", "reward") if k in meta}
+    kept = {k: meta[k] for k in ("data", "gain", "reward") if k in meta}
     kept |= {"policy": policy.shape(), "steps": total_steps(meta)}
     kept["options"] = meta["options"] | {"hidden": list(policy.hidden), "init": None, "out": None}
     kept["licence"] = each_once(licences_of(meta, one_path) + licences_of(its, other_path)) or "MIT"
@@ -562,9 +562,11 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
         f"{path}: {old.name}'s policy: {known[0]} of {len(inputs)} inputs and {known[1]} of {len(motors)} torques of "
         f"{new.name} have the same names and go on"
     )
-    options = meta.get("options", {}) | {"sensors": sensors, "without": list(opt.without)}
+    options = dict(meta.get("options", {}))
+    never = [w for w in options.get("without") or () if w not in ("asymmetric", *opt.without)]  # it learnt so, once
+    options |= {"sensors": sensors, "without": [*never, *opt.without]}
     options |= {"hidden": list(policy.hidden), "value_hidden": list(policy.value_hidden), "init": None, "out": None}
-    kept = {k: meta[k] for k in ("data", "blend", "gain", "reward") if k in meta} | shown_ahead(meta)
+    kept = {k: meta[k] for k in ("data", "blend", "joined", "gain", "reward") if k in meta} | shown_ahead(meta)
     kept["licence"] = each_once(licences_of(meta, path)) or "MIT"  # what it began from is not named any more
     kept |= {"policy": policy.shape(), "options": options, "steps": total_steps(meta), "carried": Path(path).name}
     return policy, kept | {"versions": versions(), "git": git_state()}

@@ -85,7 +85,7 @@ class Options:
 
 
 def captures_of(one: Set, folder: Path, half: str) -> list:
-    """A set's captures of that half; [] if its folder is not there.
+    """A set's captures of that half; [] if its folder is not there, or with a line if it holds too little.
 
     Test      tests/extras/test_streamed.py::test_captures"""
     built_in = one.folder in mocap.data.BUILTIN
@@ -94,7 +94,11 @@ def captures_of(one: Set, folder: Path, half: str) -> list:
         return []
     half = "both" if one.whole and half == "report" else half
     how = dict(all=True) if one.split == "all" else dict(split=one.split)
-    return metrics.captures_of(metrics.Options(motion=motion, clips=one.clips, half=half, **how))
+    try:
+        return metrics.captures_of(metrics.Options(motion=motion, clips=one.clips, half=half, **how))
+    except UserError as e:
+        print(e, flush=True)
+        return []
 
 
 def together(rows) -> dict:

@@ -50,7 +50,7 @@ FEW, MORE = 100, 2  # ASSUMED: visits of parts of --motion that have fewer clips
 PLAYERS_STAND = 1.5  # ASSUMED: s at a recording's beginning in which a player stands well enough to start under
 AIDED = 10.0  # s between failures, ASSUMED: sequences that do as well are not aided
 REACHED = 0.5  # s, ASSUMED: in which the hand that aids would have the root at its target
-PUSH_SECONDS = 2.0  # mean time between pushes
+PUSH_EVERY = 2.0  # s, mean time between pushes
 CODE = 7  # counts up when retargeting or augmenting changes what it makes: older caches are then made anew
 CHUNK = 100  # clips retargeted between two lines of progress
 
@@ -244,7 +244,7 @@ class Disturbance:
         if self.aid:
             self._lead(env)
         if self.push:
-            pushed = np.flatnonzero(rng.random(env.n) < env.dt / PUSH_SECONDS)
+            pushed = np.flatnonzero(rng.random(env.n) < env.dt / PUSH_EVERY)
             angle, size = rng.uniform(0, 2 * np.pi, len(pushed)), rng.uniform(0, self.push, len(pushed))
             env.qvel[pushed, 0] += size * np.cos(angle)
             env.qvel[pushed, 1] += size * np.sin(angle)
@@ -386,7 +386,8 @@ def key_of(opt: Options, char) -> str:
     found = (f for p in paths for f in (sorted(p.rglob("*")) if p.is_dir() else [p]) if f.is_file())
     files = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in found]
     tables = {k: v for k, v in char.spec.items() if k not in ("torque", "passive", "reward", "training")}
-    shapes = m.body_pos, m.body_quat, m.jnt_pos, m.jnt_axis, m.jnt_range, m.geom_pos, m.geom_size, m.site_pos
+    shapes = m.body_pos, m.body_quat, m.jnt_pos, m.jnt_axis, m.jnt_range, m.site_pos, m.geom_type
+    shapes += m.geom_pos, m.geom_quat, m.geom_size
     body = [tables, char.default.tolist(), char.reward_links.tolist(), *(a.tolist() for a in shapes)]
     text = json.dumps([CODE, asked, files, body], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:24]

@@ -121,7 +121,7 @@ class Player:
         self.ctrl[:] = np.clip(action, -1.0, 1.0)
         decided = time.perf_counter()
         if self.force:
-            push = self.force(self.ticks[0] * self.dt, heading(self.qpos[:, 3:7]))
+            push = self.force(self.ticks.max() * self.dt, heading(self.qpos[:, 3:7]))
             self.xfrc_applied[:, self.char.root, :3] = push
         self.batch.step(nstep=self.substeps, stage=STAGE_VEL)
         self.contact[:] = np.abs(self.sensordata[:, self.char.contact_adr]) > FORCE_LIMIT

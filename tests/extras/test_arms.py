@@ -13,7 +13,7 @@ from extras import arms, train
 from mocap import data
 from plumbing import runs
 from plumbing.cli import UserError, cli, run_main
-from policy import load_policy
+from policy import STUB, initial, load_policy, widths
 from retarget import Reference
 
 TINY = "--recipe none --envs 4 --horizon 4 --minibatch 16 --hidden 8 --value-hidden 8"
@@ -147,8 +147,15 @@ def test_ship(two, tmp_path, capsys):
     (own, _), (light, meta) = load_policy(two / "dino-contact.0"), load_policy(out)
     seen = np.random.default_rng(0).standard_normal((5, own.obs_size))
     np.testing.assert_array_equal(own.mean_action(seen), light.mean_action(seen))
-    assert light.value_hidden == arms.STUB and meta["options"]["without"] == ["contact"]
+    assert light.value_hidden == STUB and meta["options"]["without"] == ["contact"]
     assert meta["options"]["out"] is None
+    assert widths(out, "dino") == {"hidden": own.hidden}  # who goes on learning begins with a new critic
+    opt = SimpleNamespace(character="dino", gamma=0.9, min_sigma=0.01, seed=3, hidden=own.hidden, value_hidden=(7,))
+    env = SimpleNamespace(**own.shape() | {"value_scale": lambda gamma: 2.0})
+    whole, steps = initial(out, opt, env)
+    assert (whole.value_hidden, steps) == ((7,), 64) and "begins with a new one" in capsys.readouterr().out
+    np.testing.assert_array_equal(whole.actor.theta, own.actor.theta)
+    assert whole.critic.theta.any() and whole.norm.count == own.norm.count
     with pytest.raises(UserError, match="exists already"):
         arms.main(["ship", str(two / "dino-contact.0"), str(out)])
 

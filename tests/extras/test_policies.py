@@ -558,7 +558,7 @@ def test_carry_command(tmp_path, capsys):
     text = dino.path.read_text().replace("default = 288.0", "default = 144.0")
     (tmp_path / "old.toml").write_text(text)
     (tmp_path / "dino.xml").write_text(dino.xml.read_text())
-    _, path = saved(tmp_path, dino, set="reward.contact=[0.5, 1.0]")
+    _, path = saved(tmp_path, dino, set="reward.contact=[0.5, 1.0]", without=["contact", "asymmetric"])
     out = tmp_path / "new.npz"
     args = ["carry", str(path), str(out), "--from-character", str(tmp_path / "old.toml"), "--hidden", "12"]
     policies.main([*args, "--value-hidden", "6"])
@@ -568,6 +568,7 @@ def test_carry_command(tmp_path, capsys):
     assert meta["options"]["set"] == "reward.contact=[0.5, 1.0]" and meta["options"]["character"] == "dino"
     assert (b.hidden, b.value_hidden, meta["carried"], meta["steps"]) == ((12,), (6,), "p.npz", 5)
     assert meta["licence"] == "MIT"
+    assert meta["options"]["without"] == ["contact"]  # it learnt so; which critic it gets is said anew
     saved(tmp_path, dino, init=str(character.CHARACTERS / "dino.npz"))  # not named by what is carried: its terms are
     out.unlink()
     policies.main(args)

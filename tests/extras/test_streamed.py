@@ -16,7 +16,7 @@ from plumbing.cli import UserError
 CHARACTER = Path(character.CHARACTERS) / "dino.npz"
 
 
-def test_captures(tmp_path):
+def test_captures(tmp_path, capsys):
     """The halves share no capture and are all together; few captures are reported whole; no folder, none."""
     one = streamed.Set("walks", "builtin")
     names = [{c.name for c in streamed.captures_of(one, tmp_path, half)} for half in streamed.HALVES]
@@ -27,6 +27,9 @@ def test_captures(tmp_path):
     assert {c.name for c in streamed.captures_of(few, tmp_path, "select")} == names[0]  # chosen on no more than others
     for nowhere in (tmp_path, Path()):
         assert streamed.captures_of(streamed.Set("gone", "bandai"), nowhere, "report") == []
+    (tmp_path / "bandai").mkdir()
+    assert streamed.captures_of(streamed.Set("thin", "bandai"), tmp_path, "report") == []
+    assert "bandai: a folder without motion" in capsys.readouterr().out
 
 
 def test_together():

@@ -374,11 +374,14 @@ def test_cache(tmp_path, monkeypatch, capsys):
         (opt, character.load("jesse", set=["pose.spine_y=0.1"])),
     ):
         keys.add(train.key_of(other, char))
+    tilted = character.load("jesse")
+    tilted.model.geom_quat[-1] = [np.cos(0.15), 0.0, np.sin(0.15), 0.0]
+    keys.add(train.key_of(opt, tilted))
     (folder / "take.bvh").write_text("22")
     keys.add(train.key_of(opt, jesse))
     monkeypatch.setattr(train, "CODE", -1)
     keys.add(train.key_of(opt, jesse))
-    assert len(keys) == 9
+    assert len(keys) == 10
     monkeypatch.undo()
     (folder / "take.bvh").write_text("1")
     stronger = character.load("jesse", set=["torque.base.default=100", "training.lr=1.0", "reward.q=[1, 1]"])
