@@ -204,7 +204,7 @@ def planted(clip: Clip, share) -> Clip:
 
     Equation  of thigh, shin and foot:  R' = slerp(R, R_standing, 3 s² − 2 s³);  R_standing by two-bone inverse
               kinematics from the hip to an ankle as high as this clip's lowest, straight below it
-    Why       a walk that is stopped in mid-stride leaves its user on one leg, and no user stands so (ASSUMED: the lead-in of the spec says no more than standing)
+    Why       a walk that is stopped in mid-stride leaves its user on one leg, and no user stands so (ASSUMED)
     Args      share : (T,) s, 0 as it is to 1 standing
     Returns   Clip; bones keep their lengths
     Test      tests/mocap/test_mocap.py::test_planted
