@@ -30,6 +30,7 @@ from scipy.linalg import block_diag
 import character
 from character import Character
 from env import SENSORS, WITHOUT, observation_terms
+from headset.player import Player, stream_of
 from mocap import data
 from mocap.data import CONTROL_RATE
 from nn import LEAKY_SLOPE, MLP, RunningNorm
@@ -491,16 +492,17 @@ def with_layers(policy: Policy, hidden, value_hidden, path) -> Policy:
     return out
 
 
-def with_limits(policy: Policy, old: Character, new: Character) -> Policy:
+def with_limits(policy: Policy, old: Character, new: Character, springs=True) -> Policy:
     r"""The same torques from a body with other limits and springs, at the default pose.
 
     Equation  a_new = (a_old L_old + k_old (r_old − q) − k_new (r_new − q)) / L_new,  q the default pose: W and b of the
               last layer × L_old / L_new, b + the rest, log σ + log (L_old / L_new)
     Symbols   L limit, k stiffness, r the spring's angle of rest, of each hinge that both drive; all of them divided by
               size⁴, with which they grow (`character.load`), so that a body of another size does what this one did
-    Args      policy : its outputs are new's motors already
+    Args      policy : its outputs are new's motors already; springs : False where those that `hold` bear another pose,
+              which they are meant to
     Returns   policy, changed
-    Test      tests/extras/test_policies.py::test_another_body"""
+    Test      tests/extras/test_policies.py::test_another_body, test_another_pose"""
     last = policy.actor.n_layers - 1
     weights, bias = (policy.actor.params[f"{name}{last}"] for name in "Wb")
     sizes = [c.variant.get("scale", 1.0) ** 4 for c in (old, new)]
@@ -513,8 +515,34 @@ def with_limits(policy: Policy, old: Character, new: Character) -> Policy:
             pulls.append(c.model.jnt_stiffness[1 + h] * (c.model.qpos_spring[7 + h] - c.default[h]) / size)
         k, ratio = driven[1][name], limits[0] / limits[1]
         weights[:, k] *= ratio
-        bias[k] = bias[k] * ratio + (pulls[0] - pulls[1]) / limits[1]
+        bias[k] = bias[k] * ratio + springs * (pulls[0] - pulls[1]) / limits[1]
         policy.log_std[k] += np.log(ratio)
+    return policy
+
+
+def at_rest(char: Character, devices=3) -> dict:
+    """What the actor observes in the default pose under somebody who stands: name -> number.
+
+    Test      tests/extras/test_policies.py::test_another_pose"""
+    pos, quat, _, _ = stream_of(char, data.load("standing", clips="stand_005")[0], devices)
+    player = Player(char, lambda obs: np.zeros((len(obs), len(char.limits))), devices=devices)
+    player.step(pos[:1], quat[:1])  # which observes before it moves
+    return dict(zip(input_names(char, devices), player.obs[0].astype(float)))
+
+
+def reposed(policy: Policy, old: Character, new: Character, devices=3) -> Policy:
+    r"""Another default pose is taken for the old one: the policy sees itself stand as it did, and does what it did.
+
+    Equation  mean of the normaliser += o_new − o_old, o the observation `at_rest`
+    Why       a bent Dino (§5.2) whose policy still senses an upright one's angles rights itself at once
+    Args      policy : its inputs are new's already
+    Returns   policy, changed
+    Test      tests/extras/test_policies.py::test_another_pose"""
+    was, now = at_rest(old, devices), at_rest(new, devices)
+    state = policy.norm.state()
+    mean = state["mean"].copy()
+    mean[: policy.obs_size] += [value - was.get(name, value) for name, value in now.items()]
+    policy.norm.load_state(state | {"mean": mean})
     return policy
 
 
@@ -524,7 +552,7 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
     What only one of the two has a name for is silent.  A lead (`led`) is taken back where devices or the character
     change, for what it added to the headset's weights was of all devices and of that normaliser.  Another character's
     policy keeps its actions, whatever they are in newton metres, because its mass is another; its normaliser and σ
-    begin anew, because its sizes are others.
+    begin anew, because its sizes are others.  Another default pose is taken for the old one (`reposed`).
     Args      old, new : characters; opt.sensors, opt.without, opt.hidden, opt.value_hidden : of the new one
     Raises    UserError: it does not fit old; it knows the headset alone and the new one has controllers
     Test      tests/extras/test_policies.py::test_headset_only, test_another_character, test_a_variation
@@ -552,7 +580,10 @@ def carried(path, old: Character, new: Character, opt: Carry) -> tuple[Policy, d
     actor = sum(observation_terms(new, ways[1][1], sees)["actor"].values())
     policy = rearranged(policy, inputs, actor, motors)
     if old.name == new.name:
-        policy = with_limits(policy, old, new)
+        default = [dict(zip(c.hinges, c.default)) for c in (old, new)]
+        posed = any(default[0].get(h, angle) != angle for h, angle in default[1].items())
+        policy = with_limits(policy, old, new, springs=not posed)
+        policy = reposed(policy, old, new, ways[1][1]) if posed else policy
     else:
         policy.norm.load_state(RunningNorm(policy.critic_size).state())
         policy.log_std[:] = np.log(new.training.get("sigma", SIGMA))

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from test_ppo import train, whole  # noqa: F401, whole is a fixture
@@ -550,6 +551,29 @@ def test_another_body(tmp_path):
     np.testing.assert_allclose(sigma[0], sigma[1], rtol=1e-5)
     bias = [policies.with_limits(p, c, c).actor.params["b1"].copy() for p, c in ((new, after),)]
     np.testing.assert_array_equal(bias[0], new.actor.params["b1"])  # the same body: nothing
+
+
+def test_another_pose(tmp_path):
+    """A bent spine: what is sensed of it at rest, by MuJoCo, is as if it were upright, and so is what is done then."""
+    bent = {"pose.spine_y": 0.28, "pose.neck_y": -0.5, "pose.head_y": -0.55}
+    chars = character.load("dino"), character.load("dino", set=[f"{k}={v}" for k, v in bent.items()])
+    before, path = saved(tmp_path, chars[0])
+    after, _ = carried(path, *chars, Carry())
+    names, sites = input_names(chars[0]), []
+    for char in chars:
+        sim = mujoco.MjData(char.model)
+        sim.qpos[:] = char.upright
+        mujoco.mj_kinematics(char.model, sim)
+        sites.append(sim.site_xpos[char.sensor_sites[0], 2] - sim.xpos[1, 2])
+    shift = dict(zip(names, after.norm.mean - before.norm.mean))
+    for hinge, old, new in zip(chars[0].hinges, chars[0].default, chars[1].default, strict=True):
+        np.testing.assert_allclose(shift[f"q.{hinge}"], new - old, atol=1e-6)
+    assert all(v == 0.0 for n, v in shift.items() if n.startswith(("qd.", "human_")))
+    lower = sites[1] - sites[0]  # of the headset above the root; the user's heights are scaled to it
+    assert lower < -0.1 and abs(shift["user.h.z"] - lower) < 0.02 and abs(shift["user.h.y"]) < 1e-6
+    rest = [np.array([[*policies.at_rest(c).values()]], np.float32) for c in chars]
+    np.testing.assert_allclose(after.mean_action(rest[1]), before.mean_action(rest[0]), atol=1e-4)
+    assert np.abs(after.mean_action(rest[0]) - before.mean_action(rest[0])).max() > 0.01
 
 
 def test_carry_command(tmp_path, capsys):
