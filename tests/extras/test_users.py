@@ -143,6 +143,20 @@ def test_row(clip):
     for key in ("completed", "survival", "fails_every_s", "first_failure_s", "own_slide_cm_s"):
         assert row[key] == pytest.approx(other[key]), key
     assert row["captures"] == 1 and row["head_cm"] > 5
+    push = users.pushes(char, users.Options(by="push"))[", left by 1 m/s"]
+    pushed = users.row_of(char, act, [clip], 3, 1, replace(push, at=0.2))
+    assert pushed["first_failure_s"] < row["first_failure_s"] - 1.0  # it is down sooner for it
+
+
+def test_why_it_fails():
+    """A limp one topples under who stands; it is left behind, upright still, by who goes 5 m/s for 0.4 s."""
+    char = character.load("oppy")
+    limp = lambda obs: np.zeros((len(obs), len(char.limits)))  # noqa: E731
+    pos, quat = (a[:60] for a in stream_of(char, data.load("standing")[0])[:2])
+    away = pos[:12] + np.arange(12)[:, None, None] * [5.0 / data.CONTROL_RATE, 0.0, 0.0]
+    for stream, ends in (((pos, quat), (1, 0, 0)), ((away, quat[:12]), (0, 1, 0))):
+        row = users.row_of_streams(char, limp, [stream], 3, 1)
+        assert (row["falls"], row["lost"], row["diverged"]) == ends
 
 
 def test_by_time(clip):
