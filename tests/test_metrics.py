@@ -673,6 +673,14 @@ def test_halves(ref):
     assert metrics.motion_of(replace(one, rows=("tracked",)))[0] == []  # a half is of the streamed row
 
 
+def test_user_scale():
+    """--user-scale: hips as many times as high, of the captures and of the stitched sequences."""
+    opt = metrics.Options(clips="walk_1*")
+    for lists in zip(metrics.motion_of(opt), metrics.motion_of(replace(opt, user_scale=1.2)), strict=True):
+        hips, taller = ([c.hip_height for c in clips] for clips in lists)
+        assert len(hips) == 2 and taller == pytest.approx([1.2 * h for h in hips])
+
+
 def test_command(tmp_path, capsys, monkeypatch):
     """python metrics.py: the streamed row first, and a JSON of the rows asked for."""
     captures = [load("builtin", clips="walk_005")[0][:50]]
