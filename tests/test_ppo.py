@@ -545,6 +545,13 @@ def test_init_fine_tunes(whole, tmp_path, monkeypatch):
     for name, value in seen[0].items():  # weights, σ and normaliser
         np.testing.assert_array_equal(value, saved[name], err_msg=name)
     assert meta["updates"] == 1 and meta["steps"] == 64
+    arrays, meta = train(tmp_path / "c", 1, "--init", str(whole), "--gamma", "0.9", "--min-sigma", "0.2")
+    (weights, log_std), (before, _) = (np.split(a["policy.pi"], [-33]) for a in (seen[1], saved))
+    np.testing.assert_array_equal(weights, before)
+    np.testing.assert_allclose(np.exp(log_std), 0.2, rtol=1e-6)  # it was 0.135, below this run's least
+    weight = sum(w for w, _ in (character.load("jesse").reward[t] for t in TERMS))
+    assert meta["policy"]["value_scale"] == pytest.approx(10 * weight)  # the largest return by this γ, not by 0.97
+    assert arrays["policy.norm.count"] == saved["policy.norm.count"] + 64  # the normaliser goes on learning
     for flag, name in (("--hidden", r"hidden \(12,\), not \(9,\)"), ("--value-hidden", r"value_hidden \(10, 8\), not")):
         with pytest.raises(UserError, match=f"does not fit jesse: {name}.*extras.policies carry .* --character jesse"):
             train(tmp_path / "b", 1, "--init", str(whole), flag, "9")
