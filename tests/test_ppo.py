@@ -5,6 +5,7 @@ import shutil
 from dataclasses import fields, replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -372,6 +373,21 @@ def test_rate_follows_kl_and_sigma_has_a_floor(char, ref):
     assert t.adam_pi.lr == pytest.approx(1e-4 * 1.2)
 
 
+def test_gradients_are_clipped(char, ref, monkeypatch):
+    """Actor's and critic's: where next to no gradient is let through, neither moves."""
+    moved = []
+    for most in (ppo.MAX_GRAD_NORM, 1e-12):  # far below what Adam divides by at least
+        monkeypatch.setattr(ppo, "MAX_GRAD_NORM", most)
+        t = trainer_of(char, ref)
+        t.collect()
+        before = t.policy.arrays()
+        t.update()
+        after = t.policy.arrays()
+        moved.append([np.abs(after[name] - before[name]).max() for name in ("policy.pi", "policy.critic")])
+    (actor, critic), (held_actor, held_critic) = moved
+    assert held_actor < 0.01 * actor and held_critic < 0.01 * critic
+
+
 # ------------------------------------------------------------------------------------ learning
 
 
@@ -630,6 +646,7 @@ def test_switches_reach_the_environment():
     assert (plain.devices, plain.asymmetric, plain.char.variant) == (3, True, {})
     assert type(plain.starts) is Uniform and plain.disturbance is None  # the paper's
     assert (plain.root_limit == 0.30).all()
+    assert plain.char.model.opt.solver == mujoco.mjtSolver.mjSOL_PGS  # as loaded it is Newton's
     env = ppo.make_env(replace(opt, track="root"))
     assert env.char.reward["q"][0] == 0 < env.char.reward["x"][0] and env.ref.link_pos.shape[1] == 1
     for wrong in (["--without", "contact,gravity"], ["--track", "head"], ["--sensors", "none"]):
