@@ -614,6 +614,10 @@ def test_reference(char, mini, clips):
                 matrix = rotation(clip.quat[t, i]).as_matrix()
                 np.testing.assert_allclose(ref.human_rot[f, i], matrix[:, :2], atol=1e-6)
             np.testing.assert_array_equal(ref.orientation[f], clip.quat[t, [SEG["pelvis"], SEG["head"]]])
+    bent = retarget.reference(char, [dataclasses.replace(clips[0], measured=1.3)])  # as a stream would measure them
+    size = retarget.sensor_scale(char, clips[0].hip_height, 1.3)
+    np.testing.assert_allclose(bent.sensor_scale, np.tile(size, (n, 1)), rtol=1e-6)
+    np.testing.assert_allclose(bent.sensor_pos, sensors(clips[0])[0] * size)
     with pytest.raises(ValueError, match="one rate.*30.0, 60.0"):
         retarget.reference(char, [clips[0], dataclasses.replace(clips[0], rate=60.0)])
     with pytest.raises(ValueError, match="0 clips"):
