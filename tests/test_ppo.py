@@ -340,6 +340,20 @@ def test_time_to_failure(char, ref):
     assert t.terminated.any() and stats["time_to_failure"] == pytest.approx(32 * 30 / 30 / t.terminated.sum())
 
 
+def test_survival():
+    """Steps lived, and the share of those to be lived, of the episodes that ended: counted by hand."""
+    t = Trainer(tiny(envs=40, horizon=30, sigma=1.0), Reach(40))
+    t.start()
+    stats, lengths, lived = t.collect(), [], np.zeros(40)
+    for ended in t.terminated | t.truncated:
+        lived += 1
+        lengths += lived[ended].tolist()
+        lived[ended] = 0
+    assert stats["episodes"] == len(lengths) > stats["failures"] > 0
+    assert stats["length"] == pytest.approx(np.mean(lengths))
+    assert stats["survival"] == pytest.approx(np.mean(lengths) / 12)  # twelve could be lived
+
+
 def test_update_improves_both_losses(char, ref):
     t = trainer_of(char, ref, envs=16, horizon=16, minibatch=64, epochs=5)
     t.collect()
@@ -357,6 +371,8 @@ def test_update_improves_both_losses(char, ref):
     assert before[0] == pytest.approx(0.0, abs=1e-4)  # the ratio is 1, the mean of Â is 0
     raw, count = t.raw.copy(), t.policy.norm.count
     stats = t.update()
+    unexplained = np.mean((advantage - advantage.mean()) ** 2) / np.mean((target - target.mean()) ** 2)
+    assert stats["explained_variance"] == pytest.approx(1.0 - unexplained)
     after = losses()
     assert after[0] < -0.05 and after[1] < 0.7 * before[1]
     assert 0 < stats["kl"] and 0 <= stats["clip_fraction"] < 0.9
@@ -484,6 +500,17 @@ def test_resume_is_exact(whole, tmp_path):
     metrics = read_metrics(whole / METRICS)
     assert sum(metrics[f"end_{e}"].sum() for e in Env.ENDS) > 0  # episodes ended, so resets were continued, too
     assert metrics["steps"].tolist() == [64 * k for k in range(1, 7)]
+
+
+def test_seeds(char, ref):
+    """Two seeds begin in other states, with other networks and noise; the same seed does not."""
+    begun = []
+    for seed in (3, 3, 4):
+        t = trainer_of(char, ref, seed=seed)
+        begun.append((t.env.qpos.copy(), t.policy.theta_pi, t.rng.random(9)))
+    for one, again, other in zip(*begun, strict=True):
+        np.testing.assert_array_equal(one, again)
+        assert (one != other).any()
 
 
 def test_second_thread_changes_nothing(char, ref):
@@ -647,7 +674,8 @@ def test_switches_reach_the_environment():
     assert type(plain.starts) is Uniform and plain.disturbance is None  # the paper's
     assert (plain.root_limit == 0.30).all()
     assert plain.char.model.opt.solver == mujoco.mjtSolver.mjSOL_PGS  # as loaded it is Newton's
-    env = ppo.make_env(replace(opt, track="root"))
+    env = ppo.make_env(replace(opt, track="root", seed=1))
+    assert env.rng.random() != plain.rng.random()
     assert env.char.reward["q"][0] == 0 < env.char.reward["x"][0] and env.ref.link_pos.shape[1] == 1
     for wrong in (["--without", "contact,gravity"], ["--track", "head"], ["--sensors", "none"]):
         with pytest.raises(SystemExit):
