@@ -95,6 +95,23 @@ def test_largest_push(char, ref, monkeypatch):
     assert len(limp["left"]) == 0 and "0 of 1 sequences" in metrics.push_report(limp, metrics.Push(100.0, 0.5))
     with pytest.raises(UserError, match="no sequence is 31.0 s long"):
         metrics.largest_push(char, ref, cheat, 30.0, 100.0)
+    five, tried = retarget.reference(char, [data.load("builtin", clips="stand_007")[0][:50]] * 5), []
+    act = lambda env: (tried.append(env.sequence.copy()), cheat(env))[1]  # noqa: E731
+    assert metrics.largest_push(char, five, act, 0.5, 100.0, sequences=3, rounds=0, threads=1)["tried"] == 3
+    assert set(np.ravel(tried)) == {0, 2, 4}  # evenly chosen
+
+
+def test_largest_push_of_what_is_shown(char, tmp_path, monkeypatch):
+    """§4.2: a policy of the headset alone sees nothing else while it is pushed."""
+    monkeypatch.setattr(metrics, "RECOVERY", 0.2)
+    clips = [data.load("builtin", clips="stand_007")[0][:30]]
+    monkeypatch.setattr(metrics, "motion_of", lambda opt: (clips, clips))
+    less = headset_only(retarget.reference(char, clips))
+    path, out = save_policy(tmp_path / "hmd.npz", char, less, character="jesse", sensors="hmd"), tmp_path / "p.json"
+    play.main(["--policy", str(path), "--measure", "--push", "2000@0", "--threads", "1", "--json", str(out)])
+    found = metrics.largest_push(char, less, metrics.policy_action(load_policy(path)[0]), 0.0, 2000.0, threads=1)
+    assert json.loads(out.read_text()) == {k: np.array(v).tolist() for k, v in found.items()}
+    assert 0 < found["left"] < found["back"] < 2000
 
 
 # ------------------------------------------------------------------------------------ what drives it
@@ -183,7 +200,7 @@ def test_simulate_stops_at_500_steps(char, long):
     assert short.available == 7 and len(short.frames) == 8 and not short.failed
 
 
-def test_time_to_failure(char, long):
+def test_time_to_failure(char, long, monkeypatch):
     assert metrics.time_to_failure(char, long, cheat, n=3, seconds=1.0, threads=1) == float("inf")
     found = metrics.time_to_failure(char, long, metrics.zero_action, n=6, seconds=3.0, seed=4, threads=1)
     env = Env(char, long, 6, threads=1, autoreset=False)
@@ -197,6 +214,10 @@ def test_time_to_failure(char, long):
         if len(done):
             env._reset(done, env.starts.draw(draw, len(done))[0])
     assert failures >= 3 and found == pytest.approx(6 * 3.0 / failures)
+    monkeypatch.setattr(metrics, "time_to_failure", functools.partial(metrics.time_to_failure, seconds=3.0))
+    opt = play.Options(random_starts=6, seed=4, threads=1)
+    rows = [metrics.measure_one("zero", char, long, metrics.zero_action, replace(opt, seed=s)) for s in (4, 0)]
+    assert rows[0]["fails_every_s"] == found != rows[1]["fails_every_s"]  # from the starts that --seed draws
 
 
 # ------------------------------------------------------------------------------------ command line
