@@ -656,8 +656,9 @@ def test_landing_is_no_step(char, ref):
     assert metrics.measure(char, page, [rec])["steps_per_m"] == pytest.approx(1.0)
 
 
-def test_halves(ref):
-    """What policies are chosen on and what is reported have no capture in common, and are all of it."""
+def test_halves(ref, monkeypatch):
+    """What policies are chosen on and what is reported have no capture in common, and are all of it; of many captures
+    a few, evenly."""
     names = {}
     for half in metrics.HALVES:
         single, long = metrics.motion_of(metrics.Options(motion="standing", half=half))
@@ -671,6 +672,9 @@ def test_halves(ref):
     with pytest.raises(UserError, match="--half report: none of the 1 captures; valid: both, select"):
         metrics.motion_of(one)
     assert metrics.motion_of(replace(one, rows=("tracked",)))[0] == []  # a half is of the streamed row
+    monkeypatch.setattr(metrics, "MOST", 4)
+    few = metrics.captures_of(metrics.Options(motion="standing"))
+    assert [c.name for c in few] == [names["both"][i] for i in (0, 4, 7, 11)]
 
 
 def test_user_scale():
