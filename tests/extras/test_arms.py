@@ -132,6 +132,20 @@ def test_table(two, tmp_path, capsys):
         arms.table(arms.Options(out=str(two), seed=9))
 
 
+def test_an_arm_is_measured_in_its_own_body(tmp_path, monkeypatch):
+    """§4.3.1: a small Oppy's row is of a small Oppy."""
+    monkeypatch.setattr(arms, "BATCH", TINY)
+    arms.main(["run", "oppy-small", "--steps", "16", "--turn", "16", "--out", str(tmp_path)])
+    measuring = arms.Measuring(arms.Options(out=str(tmp_path), seconds=1.0, most=2))
+    measuring.clips["walks"] = [data.load("builtin", clips="walk_105")[0][:70]]
+    row = measuring.arm("oppy-small", "walks")
+    policy, _ = load_policy(tmp_path / "oppy-small.0")
+    small = train.Options(character="oppy", scale=0.7).load()
+    ref = arms.pieces(arms.reference(small, measuring.clips["walks"]), 1.0, 2)
+    again = arms.measured(small, ref, metrics.policy_action(policy), 1)
+    assert row == pytest.approx(again | {"steps": 16}, nan_ok=True)
+
+
 def test_unequal_arms_are_named():
     """Arms of one character with other steps are not to be compared; those of two characters are."""
     rows = {"dino": {"steps": 10}, "dino-contact": {"steps": 20}, "oppy": {"steps": 5}, "oppy-contact": None}
