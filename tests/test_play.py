@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -607,6 +608,26 @@ def test_shipped_figures():
     for names in (play.FIGURES[6], play.FIGURES[8]):
         steps = [load_policy(character.CHARACTERS / f"{n}.npz")[1]["steps"] for n in names]
         assert max(steps) < 1.02 * min(steps), names
+
+
+def test_horizontal():
+    """§5.2: bent over, its tail up, the shipped one follows a user for ten seconds."""
+    lean, tail, clip = {}, {}, data.load("builtin", clips=play.USER)[0][:300]
+    for name in ("dino-driven", "dino-horizontal"):
+        policy, meta = load_policy(character.CHARACTERS / f"{name}.npz")
+        char = trained_as(meta, name).load()
+        [r] = ride(char, policy.mean_action, [stream_of(char, clip)[:2]], 3, 1)
+        assert r.failures == 0
+        body, sim, up, tip = char.model.body, mujoco.MjData(char.model), [], []
+        for qpos in r.qpos[60:]:
+            sim.qpos[:] = qpos
+            mujoco.mj_kinematics(char.model, sim)
+            trunk = sim.xpos[body("spine3").id] - sim.xpos[body("pelvis").id]
+            up.append(np.degrees(np.arccos(trunk[2] / np.linalg.norm(trunk))))
+            tip.append(sim.xpos[body("tail7").id, 2])
+        lean[name], tail[name] = np.mean(up), np.mean(tip)
+    assert lean["dino-horizontal"] > lean["dino-driven"] + 12.0  # degrees
+    assert tail["dino-horizontal"] > tail["dino-driven"] + 0.1  # m
 
 
 def test_told_life():
