@@ -155,8 +155,9 @@ def check_fits(policy: Policy, env, path):
               tests/headset/test_stream.py::test_policy_of_another_character"""
     have, need = (policy.obs_size, policy.action_size), (env.obs_size, env.action_size)
     if have != need:
+        whose = anothers(load_policy(path)[1], path, env.name) if Path(path).exists() else []
         raise UserError(
-            f"{path}: a policy of {have[0]} observations and {have[1]} actions; "
+            f"{path}: {''.join(f'{w}, ' for w in whose)}a policy of {have[0]} observations and {have[1]} actions; "
             f"{env.name} needs {need[0]} and {need[1]}: use the character it was trained for"
         )
 
