@@ -59,7 +59,7 @@ OF_STREAM = {"axes", "grip", "stream_unit", "devices", "sample_rate", "user_heig
 
 FIGURES = {  # of the paper: the policies in characters/ that it puts side by side
     5: ("oppy-small", "oppy-same", "oppy-tall"),  # sizes
-    6: ("dino-driven", "dino-orientation"),  # with the orientation reward, and without it
+    6: ("dino-rewarded", "dino-orientation"),  # with the orientation reward, and without it
     8: ("dino-driven", "dino-passive", "dino-fixed"),  # the tail: two joints driven, none driven, six welded
 }
 OF_FIGURE = {"completed", "survival", "root_cm", "head_deg", "head_wobble_deg_s", "contact_agreement"}
