@@ -613,8 +613,8 @@ def captures_of(opt: Options) -> list:
 def motion_of(opt: Options) -> tuple[list, list]:
     """`captures_of` for the streamed row, and the stitched sequences for all others.
 
-    Raises    UserError: no such row
-    Test      tests/test_metrics.py::test_halves"""
+    Raises    UserError: no such row; nothing but single frames, which are left out
+    Test      tests/test_metrics.py::test_halves, test_user_scale, test_single_frames_are_left_out"""
     if wrong := set(opt.rows) - set(ROWS):
         raise UserError(f"--rows {','.join(sorted(wrong))}: unknown; valid: {', '.join(ROWS)}")
     single, split = captures_of(opt), "all" if opt.all else opt.split

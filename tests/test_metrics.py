@@ -685,6 +685,16 @@ def test_user_scale():
         assert len(hips) == 2 and taller == pytest.approx([1.2 * h for h in hips])
 
 
+def test_single_frames_are_left_out(monkeypatch):
+    """A sequence of one frame has no step to play: the others are measured, and alone it is said."""
+    whole, opt = load("builtin", clips="walk_105")[0], metrics.Options(clips="walk_105")
+    monkeypatch.setattr(metrics.mocap.data, "sequences", lambda *_, **__: [whole[:1], whole])
+    assert [len(c) for c in metrics.motion_of(opt)[1]] == [len(whole)]
+    monkeypatch.setattr(metrics.mocap.data, "sequences", lambda *_, **__: [whole[:1]])
+    with pytest.raises(UserError, match="builtin: a single frame; valid: motion, of two frames or more"):
+        metrics.motion_of(opt)
+
+
 def test_command(tmp_path, capsys, monkeypatch):
     """python metrics.py: the streamed row first, and a JSON of the rows asked for."""
     captures = [load("builtin", clips="walk_005")[0][:50]]
