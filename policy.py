@@ -76,6 +76,12 @@ class Policy:
             "activation": self.activation,
         }
 
+    def with_critic(self, value_hidden, rng) -> Policy:
+        """The same actor with a new critic of such layers.  Test: tests/extras/test_arms.py::test_ship"""
+        out = Policy(sigma=1.0, rng=rng, **self.shape() | {"value_hidden": value_hidden})
+        out.load(self.arrays() | {"policy.critic": out.critic.theta})
+        return out
+
     def summary(self) -> str:
         """Inputs, actions and weights, for a run's first line."""
         inputs = f"{self.obs_size} observations ({self.critic_size} for the critic), {self.action_size} actions"
@@ -199,10 +205,7 @@ def initial(path, opt, env) -> tuple[Policy, int]:
     Test      tests/test_ppo.py::test_init_fine_tunes, tests/extras/test_arms.py::test_ship"""
     policy, meta = load_policy(path)
     if policy.value_hidden == STUB != tuple(opt.value_hidden):
-        shape = policy.shape() | {"value_hidden": opt.value_hidden}
-        whole = Policy(sigma=1.0, rng=np.random.default_rng([opt.seed, 2]), **shape)
-        whole.load(policy.arrays() | {"policy.critic": whole.critic.theta})
-        policy = whole
+        policy = policy.with_critic(opt.value_hidden, np.random.default_rng([opt.seed, 2]))
         print(f"{path}: has no critic, to be small; begins with a new one")
     check_exact(policy, meta, path, opt, env)
     policy.norm.frozen, policy.value_scale = False, env.value_scale(opt.gamma)
@@ -218,8 +221,8 @@ def widths(path, character) -> dict:
     policy, meta = load_policy(path)
     if odd := anothers(meta, path, character):
         raise misfit(path, character, odd)
-    own = {"hidden": policy.hidden, "value_hidden": policy.value_hidden}
-    return {k: v for k, v in own.items() if v != STUB or k == "hidden"}
+    critic = {} if policy.value_hidden == STUB else {"value_hidden": policy.value_hidden}
+    return {"hidden": policy.hidden} | critic
 
 
 def trained_as(meta, path) -> Switches | None:

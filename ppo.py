@@ -203,8 +203,9 @@ class Trainer:
 
     def __init__(self, opt: Options, env: Env, policy: Policy | None = None):
         sizes = env.obs_size, env.critic_size, env.action_size, opt.hidden, opt.value_hidden
-        new = lambda: Policy(*sizes, opt.sigma, env.value_scale(opt.gamma), np.random.default_rng([opt.seed, 2]))  # noqa: E731
-        self.opt, self.env, self.policy = opt, env, policy or new()
+        self.opt, self.env = opt, env
+        rng = np.random.default_rng([opt.seed, 2])
+        self.policy = policy or Policy(*sizes, opt.sigma, env.value_scale(opt.gamma), rng)
         self.rng = np.random.default_rng([opt.seed, 1])  # exploration and minibatches
         self.adam_pi = Adam(self.policy.theta_pi.size, opt.lr)
         self.adam_v = Adam(self.policy.critic.theta.size, opt.value_lr)

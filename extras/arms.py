@@ -46,7 +46,7 @@ from plumbing.cli import (
     words_first,
 )
 from plumbing.files import atomic_write, check_folders
-from policy import STUB, Policy, check_fits, load_policy, trained_as
+from policy import STUB, check_fits, load_policy, trained_as
 from retarget import Reference, reference
 
 # ASSUMED: half of ppo.py's batch, so that a million steps are 244 updates.  σ starts at the default 0.135: from scratch
@@ -366,9 +366,7 @@ def ship(run, path) -> dict:
     Test      tests/extras/test_arms.py::test_ship"""
     meta = policies.ship(run, path)
     policy, _ = load_policy(path)
-    shape = policy.shape() | {"value_hidden": STUB}
-    light = Policy(sigma=1.0, rng=np.random.default_rng(0), **shape)
-    light.load(policy.arrays() | {"policy.critic": light.critic.theta})
+    light = policy.with_critic(STUB, np.random.default_rng(0))
     meta |= {"policy": light.shape(), "options": meta["options"] | {"value_hidden": list(STUB)}}
     runs.save_checkpoint(path, light.arrays(), meta)
     return meta

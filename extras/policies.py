@@ -527,7 +527,7 @@ def at_rest(char: Character, devices=3) -> dict:
     pos, quat, _, _ = stream_of(char, data.load("standing", clips="stand_005")[0], devices)
     player = Player(char, lambda obs: np.zeros((len(obs), len(char.limits))), devices=devices)
     player.step(pos[:1], quat[:1])  # which observes before it moves
-    return dict(zip(input_names(char, devices), player.obs[0].astype(float)))
+    return dict(zip(input_names(char, devices, False), player.obs[0].astype(float), strict=True))
 
 
 def reposed(policy: Policy, old: Character, new: Character, devices=3) -> Policy:
