@@ -85,7 +85,7 @@ class Options:
 
 
 def captures_of(one: Set, folder: Path, half: str) -> list:
-    """A set's captures of that half; [] if its folder is not there, or with a line if it holds too little.
+    """A set's captures of that half; [] if its folder is not there.
 
     Test      tests/extras/test_streamed.py::test_captures"""
     built_in = one.folder in mocap.data.BUILTIN
@@ -94,11 +94,7 @@ def captures_of(one: Set, folder: Path, half: str) -> list:
         return []
     half = "both" if one.whole and half == "report" else half
     how = dict(all=True) if one.split == "all" else dict(split=one.split)
-    try:
-        return metrics.captures_of(metrics.Options(motion=motion, clips=one.clips, half=half, **how))
-    except UserError as e:
-        print(e, flush=True)
-        return []
+    return metrics.captures_of(metrics.Options(motion=motion, clips=one.clips, half=half, **how))
 
 
 def together(rows) -> dict:
@@ -159,7 +155,7 @@ def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, d
 
 
 def main(argv=None) -> int:
-    """Print the tables.  -> exit status, 1 if a recording could not be read
+    """Print the tables.  -> exit status, 1 if a set or a recording could not be read
 
     Test      tests/extras/test_streamed.py::test_command, test_wrong_commands"""
     opt = cli(Options, metrics.listed(argv, "--policy"), "extras.streamed", __doc__)
@@ -177,8 +173,9 @@ def main(argv=None) -> int:
         char, devices = load_character(own, meta, path), devices_of(meta, path, None)
         check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
         cast.append((policy, path, char, devices))
-    captures = {one.title: captures_of(one, Path(folder), opt.half) for one in SETS}
-    if gone := [title for title, clips in captures.items() if not clips]:
+    read, thin = sound(lambda one: (one.title, captures_of(one, Path(folder), opt.half)), SETS)
+    captures = dict(read)
+    if gone := [one.title for one in SETS if not captures.get(one.title)]:
         print(f"{f'--mocap {folder} is' if folder else 'no --mocap:'} without {'; '.join(gone)}", flush=True)
     captures, out, broken = {title: clips for title, clips in captures.items() if clips}, {}, []
     for policy, path, char, devices in cast:
@@ -194,8 +191,9 @@ def main(argv=None) -> int:
             print("| " + " | ".join([title, *cells]) + " |", flush=True)
     if opt.json:
         atomic_write(opt.json, metrics.as_json(out))
-    print(*broken, sep="\n", end="\n" if broken else "")
-    return int(bool(broken))
+    told = [*thin, *broken]
+    print(*told, sep="\n", end="\n" if told else "")
+    return int(bool(told))
 
 
 if __name__ == "__main__":

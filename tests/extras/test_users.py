@@ -108,14 +108,11 @@ def test_pushed_while_played(clip):
     np.testing.assert_array_equal(calm[0].qpos[: at + 1], pushed[0].qpos[: at + 1])
     sideways = pushed[0].qpos[at : at + 8, 1] - calm[0].qpos[at : at + 8, 1]
     assert sideways[0] == 0.0 and (np.diff(sideways) > 0).all() and sideways[-1] > 0.05
-    seconds = {}
     for short in (10, 17):  # beside one whose stream ends before the push, or within it
         beside = [tuple(part[:short] for part in streams[0]), streams[0]]
         force = replace(rows[", left by 1 m/s"], at=0.5).force
         _, both = ride(char, limp, beside, force=force)
-        np.testing.assert_array_equal(both.qpos[: at + 8], pushed[0].qpos[: at + 8])
-        seconds[short] = len(both.qpos)
-    assert len(set(seconds.values())) == 1
+        np.testing.assert_array_equal(both.qpos, pushed[0].qpos)  # to the end: it is pushed as long, and once
 
 
 def test_crossed(clip):
