@@ -110,7 +110,8 @@ def comparison_sheet(arms: list[Arm], clip, opt: Options, size=(300, 320), numbe
     tracked, user = "tracked" in opt.rows, clip
     if not tracked:  # the human where the stream has them, lead-in and all
         clip = stream_of(arms[0].char, clip)[2]
-    last = min(len(clip) - 1, EPISODE_STEPS, round((opt.seconds or 10.0) * rate))
+    longest = min(len(clip) - 1, EPISODE_STEPS) if tracked else len(clip) - 1
+    last = min(longest, round((opt.seconds or 10.0) * rate))
     step = max(1, round(opt.every * rate)) if opt.every else max(1, last / (PICTURES - 1))
     frames = np.unique(np.arange(0, last + 1, step).round().astype(int))
     times = [f"{t / rate:.1f} s" for t in frames]
@@ -371,7 +372,7 @@ def film(arms: list[Arm], clip, opt: Options, numbers, size=(480, 480)):
     from plumbing import render
 
     user, clip = clip, stream_of(arms[0].char, clip)[2]
-    last, films = min(len(clip) - 1, EPISODE_STEPS, round((opt.seconds or 10.0) * CONTROL_RATE)), []
+    last, films = min(len(clip) - 1, round((opt.seconds or 10.0) * CONTROL_RATE)), []
     for a in arms:
         recording, seen = played(a, user, opt)
         lived = range(min(last + 1, len(recording.frames)))

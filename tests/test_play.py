@@ -527,6 +527,10 @@ def test_comparison_sheet(two, tmp_path, monkeypatch):
     monkeypatch.setattr(retarget, "draw", blank), monkeypatch.setattr(play, "pictures", blank)
     coarse = play.comparison_sheet(arms, clips[0], play.Options(threads=1, every=0.5, seconds=1.0), size=(96, 80))
     assert coarse.shape[1] == 3 * 96
+    monkeypatch.setattr(play, "EPISODE_STEPS", 15)  # by which a tracked sequence ends, no streamed one
+    for row, columns in (("tracked", 2), ("streamed", 3)):
+        asked = play.Options(threads=1, every=0.5, seconds=1.0, rows=(row,))
+        assert play.comparison_sheet(arms, clips[0], asked, size=(96, 80)).shape[1] == columns * 96
 
 
 @pytest.fixture
