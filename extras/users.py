@@ -166,7 +166,7 @@ def row_of_streams(char: Character, act, streams, devices, threads, push=None) -
     counts, ends = tally(rides), sum((r.ends for r in rides), Counter())
     return {
         "captures": len(rides),
-        **{k: counts[k] for k in ("completed", "survival", "fails_every_s", "first_failure_s")},
+        **counts,
         "falls": ends["fall"],
         "lost": ends["away"],
         "diverged": ends["bad"],

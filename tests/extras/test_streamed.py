@@ -10,6 +10,7 @@ import pytest
 import character
 import metrics
 from extras import streamed
+from headset.player import ride, stream_of
 from mocap import data
 from plumbing.cli import UserError
 
@@ -38,6 +39,52 @@ def test_together():
     assert both["within_1m"] == pytest.approx(np.mean([1, 0, 0, 0])) and both["survival"] == pytest.approx(0.7)
     assert both["fails_every_s"] == pytest.approx(5.0) and "root_cm" not in both
     assert streamed.together([a | {"failures": 0}])["fails_every_s"] == float("inf")
+
+
+def test_trained_captures(tmp_path):
+    """What is trained on, whole: no capture that is held out, and of the built-in ones sidesteps and stops alone."""
+    aside = [s for s in streamed.TRAINED if s.folder in ("builtin", "standing")]
+    names = [c.name for one in aside for c in streamed.captures_of(one, tmp_path, "train")]
+    assert len(names) == 9 and {n.rpartition("_")[0] for n in names} == {"sidestep", "stop"}
+    back = {c.name for c in streamed.captures_of(streamed.TRAINED[0], tmp_path, "train")}
+    assert back == {c.name for c in data.load("backwards", split="train")}
+
+
+def test_worn_otherwise():
+    """The first round is the streams; later a device is off by as much at every tick, within what it shakes."""
+    rng = np.random.default_rng(0)
+    streams = [(rng.normal(size=(t, 3, 3)), rng.normal(size=(t, 3, 4))) for t in (400, 60)]
+    out = streamed.worn_otherwise(streams, 3)
+    assert len(out) == 6 and all(a is b for a, b in zip(out, streams))
+    off = np.stack([np.mean(out[k][0] - streams[0][0], axis=0) for k in (2, 4)])  # (round, device, axis)
+    assert 0.5 * streamed.PUT < off.std() < 2 * streamed.PUT and np.abs(off[0] - off[1]).min() > 0
+    shaken = out[2][0] - streams[0][0] - off[0]
+    assert shaken.std() == pytest.approx(streamed.SHAKEN, rel=0.05)
+    assert out[2][1] is streams[0][1]
+    again = streamed.worn_otherwise(streams, 2)
+    assert all(np.array_equal(a[0], b[0]) for a, b in zip(again, out))  # the same noise, for every policy
+
+
+def test_rounds(tmp_path, monkeypatch, capsys):
+    """Two rounds: twice the captures, and the failures of both, counted ride by ride."""
+    one = streamed.Set("aside", "builtin", "train", "stop*")
+    monkeypatch.setattr(streamed, "TRAINED", (one,))
+    monkeypatch.setattr(streamed, "MINUTE", 3.0)
+    out = tmp_path / "table.json"
+    words = ["--character", "dino", "--half", "train", "--rounds", "2", "--json", str(out), "--threads", "1"]
+    assert streamed.main(words) == 0
+    aside, every, limp, _ = json.loads(out.read_text()).values()
+    assert f"{CHARACTER}, dino, training captures, 2 rounds" in capsys.readouterr().out
+    policy, _, _ = metrics.find_policy(metrics.Options(character="dino"))
+    char = character.load("dino")
+    streams = [stream_of(char, c, 3)[:2] for c in streamed.captures_of(one, tmp_path, "train")]
+    still = lambda obs: np.zeros((len(obs), len(char.limits)))  # noqa: E731
+    for row, act in ((every, policy.mean_action), (limp, still)):
+        rides = [ride(char, act, [s])[0] for s in streamed.worn_otherwise(streams, 2)]
+        assert row["clips"] == len(rides) == 2 * len(streams)
+        assert row["failures"] == sum(r.failures for r in rides)
+        assert row["completed"] == pytest.approx(np.mean([r.failures == 0 for r in rides]))
+    assert limp["failures"] > 0 and aside["failures"] == every["failures"]
 
 
 def test_motionless():
