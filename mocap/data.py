@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from human import Clip, resample
-from mocap import bvh, gait
+from mocap import bvh, exercise, gait
 from mocap.augment import reverse
 from mocap.guess import unknown_rig
 from mocap.rigs import (
@@ -95,8 +95,13 @@ PROTOCOL1 = """
 91_06 91_36 91_37 91_42 91_43 91_45 93_06 94_16
 """
 NAMED = {"protocol1": frozenset(PROTOCOL1.split())}  # sets of clips that --clips knows by name
-BUILTIN = {"builtin": gait.MIX, "standing": gait.STANDING, "backwards": gait.BACKWARDS}  # no download
-MOTION = "builtin, standing, backwards, a .bvh or .amc file, a folder of them, several with commas between them"
+BUILTIN = {  # no download
+    "builtin": gait.MIX,
+    "standing": gait.STANDING,
+    "backwards": gait.BACKWARDS,
+    "exercises": exercise.MIX,
+}
+MOTION = f"{', '.join(BUILTIN)}, a .bvh or .amc file, a folder of them, several with commas between them"
 
 
 @dataclass
@@ -114,15 +119,16 @@ class MotionFlags:
 
 
 def builtin_clips(rate=CONTROL_RATE, seed=0, name="builtin") -> list[Clip]:
-    """The procedural human of mocap/gait.py: people who walk (builtin), stand and step (standing), or step back
-    (backwards: those who step forwards, `mocap.augment.reverse`d).
+    """The procedural human: people who walk (builtin), stand and step (standing), step back (backwards: those who step
+    forwards, `mocap.augment.reverse`d), all of mocap/gait.py, or exercise in place (exercises, mocap/exercise.py).
 
     Twenty clips, two of them held out by their numbers; and ten more, of every kind and by other people, all held out.
     Test      tests/mocap/test_mocap.py::test_builtin, ::test_joined"""
     mix, out = BUILTIN[name], []
-    library = gait.library(rate=rate, seed=seed, mix=mix)
+    library_of = exercise.library if name == "exercises" else gait.library
+    library = library_of(rate=rate, seed=seed, mix=mix)
     each = tuple({kind: (kind, ranges) for kind, ranges in reversed(mix)}.values())  # one of every kind
-    held_out = gait.library(minutes=5.0, rate=rate, seed=seed + 1000, mix=each)
+    held_out = library_of(minutes=5.0, rate=rate, seed=seed + 1000, mix=each)
     numbers = [(i + 5) % len(library) for i in range(len(library))]  # so that 005 and 015 are straight walks
     numbers += [105 + 10 * i for i in range(len(held_out))]
     for m, number in zip(library + held_out, numbers, strict=True):

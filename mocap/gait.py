@@ -175,18 +175,19 @@ def smooth(x):
     return x * x * x * (10.0 - 15.0 * x + 6.0 * x * x)
 
 
-def _noise(rng, t, top, n=6):
+def noise(rng, t, top, n=6):
     """Smooth zero-mean noise of about unit variance: n sinusoids below `top` Hz."""
     f, p = rng.uniform(0.15, 1.0, n) * top, rng.uniform(0, 2 * np.pi, n)
     return np.sin(2 * np.pi * np.outer(t, f) + p).sum(1) * np.sqrt(2.0 / n)
 
 
-def _rot(axis, angle):
+def about(axis, angle):
     """(T, 3, 3) rotation matrices about one coordinate axis."""
     return Rotation.from_euler(axis, np.asarray(angle)[:, None]).as_matrix()
 
 
-def _apply(r, v):
+def rotate(r, v):
+    """Rotations (T, 3, 3) of one vector (3,) or of a vector each (T, 3) -> (T, 3)."""
     return np.einsum("tij,...j->t...i", r, v) if np.ndim(v) == 1 else np.einsum("tij,tj->ti", r, v)
 
 
@@ -226,8 +227,8 @@ class _Plan:
         inside = slice(n * FINE, (n + self.frames) * FINE)
         self.duty = _duty(p.speed, self.jog)
         self.delta = (self.duty - 0.5) / 2  # phase in the middle of double support, where the clock may rest
-        wobble = 0.03 * p.variation * _noise(rng, t, 0.3)
-        wander = 0.06 * p.variation * _noise(rng, t, 0.25)
+        wobble = 0.03 * p.variation * noise(rng, t, 0.3)
+        wander = 0.06 * p.variation * noise(rng, t, 0.25)
 
         f = stride_frequency(max(p.speed, 5.0 * abs(p.sidestep)), p.height, self.jog)  # ASSUMED 5: short side steps
         if p.cadence is not None:
@@ -385,10 +386,10 @@ def _foot(plan, body, p, style, side, scale):
     pitch = curve(at * 100) * DEG * scale
     flat = keys[keys[:, 1] == 0, 0][:2] / 100
     to_ball = smooth((at - flat[0]) / (flat[1] - flat[0])) * (1 - smooth(s))  # pivot: heel 0 .. ball 1
-    rot = _rot("z", yaw) @ _rot("y", -pitch)
-    up = _rot("z", yaw)
+    rot = about("z", yaw) @ about("y", -pitch)
+    up = about("z", yaw)
     pivot = body.heel + to_ball[:, None] * (body.ball - body.heel)
-    ankle = np.stack([x, y, lift + body.ankle_height], 1) + _apply(up, pivot) - _apply(rot, pivot)
+    ankle = np.stack([x, y, lift + body.ankle_height], 1) + rotate(up, pivot) - rotate(rot, pivot)
     return ankle, rot, yaw
 
 
@@ -409,10 +410,10 @@ def two_bone_leg(hip, ankle, forward, a, b):
     frame = np.stack([np.cross(y, z), y, z], 2)
     alpha = np.arccos(np.clip((a * a + r * r - b * b) / (2 * a * r), -1, 1))
     beta = np.arccos(np.clip((b * b + r * r - a * a) / (2 * b * r), -1, 1))
-    return frame @ _rot("y", -alpha), frame @ _rot("y", beta)
+    return frame @ about("y", -alpha), frame @ about("y", beta)
 
 
-def _lowered(want, limit, rate, half=0.30):
+def lowered(want, limit, rate, half=0.30):
     """Lower `want` smoothly so that it never exceeds `limit`: a running maximum, then an average as wide."""
     w = max(int(half * rate), 1)
     over = maximum_filter1d(np.maximum(want - limit, 0.0), 2 * w + 1, mode="nearest")
@@ -426,7 +427,7 @@ def _arm_base(plan, f, habit, rng, p):
     out = np.zeros((len(phase), 2, 4))
     for j, o in enumerate((0.0, 0.5)):
         swing = -np.cos(2 * np.pi * (phase - o + 0.02))  # back at the heel strike of the same side
-        drift = 2.0 * p.variation * _noise(rng, plan.t[plan.pick], 0.4)
+        drift = 2.0 * p.variation * noise(rng, plan.t[plan.pick], 0.4)
         if plan.jog:  # ASSUMED 85 degrees of elbow, forearms slightly inward
             out[:, j] = np.stack(
                 [-12 + 26 * amount * swing + drift, 0 * phase + 17, 0 * phase + 14, 85 + 12 * swing], 1
@@ -512,8 +513,8 @@ def _frames(plan, p, rng, play):
     )
     still, size = 1 - gate, p.height / 1.75
     amount = np.clip(np.sqrt(np.maximum(v, 0) / (2.5 if plan.jog else 1.3)), 0, 1.15)  # [Sekiya98]
-    noises = [_noise(rng, t, top) * p.variation for top in (0.25, 0.22, 0.3)]
-    dip = p.crouch * size * still * np.clip(_noise(play, t, 0.35), 0.0, 1.0) if p.crouch else 0.0 * t
+    noises = [noise(rng, t, top) * p.variation for top in (0.25, 0.22, 0.3)]
+    dip = p.crouch * size * still * np.clip(noise(play, t, 0.35), 0.0, 1.0) if p.crouch else 0.0 * t
     return _Frames(t, phase, psi, v, turn, gate, still, amount, *noises, dip)
 
 
@@ -556,9 +557,11 @@ def _trunk(plan, style, f, vary):
     pitch_chest = (9 if plan.jog else 2.5) * DEG * f.amount + 1 * DEG * f.nod * f.still + 120 * DEG * f.dip
     nod = 2 * DEG + 6 * DEG * f.still * f.nod
     rots = {
-        "pelvis": _rot("z", f.psi + yaw) @ _rot("y", pitch) @ _rot("x", roll),
-        "chest": _rot("z", f.psi + yaw_chest) @ _rot("y", pitch_chest) @ _rot("x", -0.3 * (roll + lean) - 1.2 * lean),
-        "head": _rot("z", f.psi + look) @ _rot("y", nod) @ _rot("x", -0.3 * lean),
+        "pelvis": about("z", f.psi + yaw) @ about("y", pitch) @ about("x", roll),
+        "chest": about("z", f.psi + yaw_chest)
+        @ about("y", pitch_chest)
+        @ about("x", -0.3 * (roll + lean) - 1.2 * lean),
+        "head": about("z", f.psi + look) @ about("y", nod) @ about("x", -0.3 * lean),
     }
     return rots, yaw
 
@@ -571,50 +574,50 @@ def _pelvis(plan, body, style, f, feet, r_pelvis, up, side):
     pelvis = np.stack([x - s * side - c * back, y + c * side - s * back, 0 * f.t], 1)
     reach = np.sqrt(body.thigh**2 + body.shin**2 + 2 * body.thigh * body.shin * np.cos(style["knee"]))
     limits = []
-    for hip, (ankle, _, _) in zip(_hips(body, pelvis, r_pelvis), feet, strict=True):
+    for hip, (ankle, _, _) in zip(hips_of(body, pelvis, r_pelvis), feet, strict=True):
         flat = np.sum((hip - ankle)[:, :2] ** 2, 1)
         limits.append(ankle[:, 2] + np.sqrt(np.maximum(reach**2 - flat, 0.2 * reach**2)) - hip[:, 2])
     bent = 0.045 * (body.height / 1.75) if plan.jog else 0.0
     want = body.thigh + body.shin + body.ankle_height - bent + up
-    pelvis[:, 2] += _lowered(want, np.min(limits, axis=0), plan.rate) - f.dip
+    pelvis[:, 2] += lowered(want, np.min(limits, axis=0), plan.rate) - f.dip
     return pelvis
 
 
-def _hips(body, pelvis, r_pelvis):
+def hips_of(body, pelvis, r_pelvis):
     """The hip joints, left and right, (T, 3) each."""
-    return [pelvis + _apply(r_pelvis, np.array([0, sign * body.hip_half_width, 0])) for sign in (1, -1)]
+    return [pelvis + rotate(r_pelvis, np.array([0, sign * body.hip_half_width, 0])) for sign in (1, -1)]
 
 
-def _legs(body, f, feet, yaw, rots, poss):
+def pose_legs(body, f, feet, yaw, rots, poss):
     """Thighs, shins and feet, between the pelvis and where the feet are; -> ball joints (T, 2, 3)."""
     ball = np.zeros((len(f.t), 2, 3))
-    hips = _hips(body, poss["pelvis"], rots["pelvis"])
+    hips = hips_of(body, poss["pelvis"], rots["pelvis"])
     for j, (e, hip, (ankle, r_foot, yaw_foot)) in enumerate(zip("lr", hips, feet, strict=True)):
         aim = 0.5 * (yaw_foot + f.psi + yaw)
         thigh, shin = two_bone_leg(hip, ankle, np.stack([np.cos(aim), np.sin(aim), 0 * aim], 1), body.thigh, body.shin)
         rots |= {f"thigh_{e}": thigh, f"shin_{e}": shin, f"foot_{e}": r_foot}
         poss[f"thigh_{e}"] = hip
-        poss[f"shin_{e}"] = hip + _apply(thigh, np.array([0, 0, -body.thigh]))
-        poss[f"foot_{e}"] = poss[f"shin_{e}"] + _apply(shin, np.array([0, 0, -body.shin]))
-        ball[:, j] = poss[f"foot_{e}"] + _apply(r_foot, body.ball)
+        poss[f"shin_{e}"] = hip + rotate(thigh, np.array([0, 0, -body.thigh]))
+        poss[f"foot_{e}"] = poss[f"shin_{e}"] + rotate(shin, np.array([0, 0, -body.shin]))
+        ball[:, j] = poss[f"foot_{e}"] + rotate(r_foot, body.ball)
     return ball
 
 
-def _arms(body, angles, wrist, rots, poss):
+def pose_arms(body, angles, wrist, rots, poss):
     """Upper arms, forearms and hands by their angles; a wrist of None does not turn."""
     for j, (e, sign) in enumerate((("l", 1), ("r", -1))):
         flex, abd, inward, elbow = angles[:, j].T
-        upper = rots["chest"] @ _rot("y", -flex) @ _rot("x", sign * abd) @ _rot("z", -sign * inward)
-        fore = hand = upper @ _rot("y", -elbow)
+        upper = rots["chest"] @ about("y", -flex) @ about("x", sign * abd) @ about("z", -sign * inward)
+        fore = hand = upper @ about("y", -elbow)
         if wrist is not None:
-            hand = fore @ _rot("y", -wrist[:, j, 0]) @ _rot("x", sign * wrist[:, j, 1])
+            hand = fore @ about("y", -wrist[:, j, 0]) @ about("x", sign * wrist[:, j, 1])
         rots |= {f"upper_arm_{e}": upper, f"forearm_{e}": fore, f"hand_{e}": hand}
-        poss[f"upper_arm_{e}"] = poss["chest"] + _apply(rots["chest"], body.shoulder * [1, sign, 1])
-        poss[f"forearm_{e}"] = poss[f"upper_arm_{e}"] + _apply(upper, np.array([0, 0, -body.upper_arm]))
-        poss[f"hand_{e}"] = poss[f"forearm_{e}"] + _apply(fore, np.array([0, 0, -body.forearm]))
+        poss[f"upper_arm_{e}"] = poss["chest"] + rotate(rots["chest"], body.shoulder * [1, sign, 1])
+        poss[f"forearm_{e}"] = poss[f"upper_arm_{e}"] + rotate(upper, np.array([0, 0, -body.upper_arm]))
+        poss[f"hand_{e}"] = poss[f"forearm_{e}"] + rotate(fore, np.array([0, 0, -body.forearm]))
 
 
-def _continuous(quat):
+def continuous(quat):
     """(T, s, 4) without jumps between q and -q; the first has w > 0."""
     flip = np.where(np.sum(quat[1:] * quat[:-1], -1) < 0, -1.0, 1.0)
     first = np.where(quat[:1, :, 0] < 0, -1.0, 1.0)
@@ -670,19 +673,19 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
     scale = f.amount if plan.jog else np.minimum(f.amount, 1.1)
     feet = [_foot(plan, body, p, style, sign, scale) for sign in (1, -1)]
     poss = {"pelvis": _pelvis(plan, body, style, f, feet, rots["pelvis"], up, side)}
-    poss["chest"] = poss["pelvis"] + _apply(rots["pelvis"], body.chest)
-    poss["head"] = poss["chest"] + _apply(rots["chest"], body.head)
-    ball = _legs(body, f, feet, yaw, rots, poss)
+    poss["chest"] = poss["pelvis"] + rotate(rots["pelvis"], body.chest)
+    poss["head"] = poss["chest"] + rotate(rots["chest"], body.head)
+    ball = pose_legs(body, f, feet, yaw, rots, poss)
     angles, wrist = _arm_base(plan, f, vary(0.15), rng, p), None
     if kind == "gesture":
         angles = _gestures(angles, f.t, duration, p, rng)
     if p.strokes:
         angles, wrist = _strokes(angles, f.t, duration, p, play)
-    _arms(body, angles, wrist, rots, poss)
+    pose_arms(body, angles, wrist, rots, poss)
     quat = np.stack([Rotation.from_matrix(rots[k]).as_quat(scalar_first=True) for k in SEGMENTS], 1)
     return {
         "pos": np.stack([poss[k] for k in SEGMENTS], 1),
-        "quat": _continuous(quat),
+        "quat": continuous(quat),
         "ball": ball,
         "rate": float(rate),
         "name": f"{kind}_{seed}",

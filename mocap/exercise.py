@@ -1,0 +1,303 @@
+r"""Built-in motions of people who exercise in place: squats, toe touches, lunges, jumping jacks, boxing.
+
+    EXERCISES ──► _repeat: keys, one repetition after the other ──► _between ──► a pose at every frame
+    pose ──► feet on the floor, trunk and arms by their angles ──► _balanced: the pelvis ──► legs by two-bone IK
+
+A headset sinks by half its height when its user touches the toes, and flies when they jump, and neither is in a walk.
+An exercise is a few key poses, min-jerk between them [Flash85], again and again, larger and smaller, quicker and
+slower.  Where the pelvis is comes out of the balance: the centre of mass stays above the feet that bear it.
+
+Frames, units and the human are those of mocap/gait.py, whose limbs these are; sources not named there
+  [Winter09]   Winter, Biomechanics and Motor Control of Human Movement, 4th ed., table 4.1: masses of the segments.
+ASSUMED   the poses and the numbers below that name no source: gymnastics as taught at school, no recorded person.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+from scipy.ndimage import convolve1d
+from scipy.spatial.transform import Rotation
+
+from human import SEGMENTS
+from mocap.gait import (
+    DEG,
+    GRAVITY,
+    Body,
+    about,
+    continuous,
+    hips_of,
+    lowered,
+    noise,
+    pose_arms,
+    pose_legs,
+    rotate,
+    smooth,
+)
+
+# A pose.  Trunk [deg]: bow forwards, tilt and turn to the left; nod and look of the head beside it.  dip: how far the
+# pelvis sinks.  Feet, left and right: ahead, out to its side, up [m at 1.75 m of height], toe up [deg].  Arms as in
+# mocap/gait.py [deg]: flexion, abduction, inward rotation, elbow.
+TRUNK = ("bow", "tilt", "turn", "nod", "look", "dip")
+FOOT, ARM = ("ahead", "out", "up", "toe"), ("flex", "abd", "inward", "elbow")
+CHANNELS = (*TRUNK, *(f"{name}_{e}" for e in "lr" for name in (*FOOT, *ARM)))
+STANDS = {"out": 0.085, "abd": 8, "inward": 8, "elbow": 12}
+MASSES = {  # [Winter09, table 4.1], as shares of the whole body's; of a limb one side's
+    "trunk": 0.497, "head": 0.081, "upper_arm": 0.028, "forearm": 0.016, "hand": 0.006,
+    "thigh": 0.100, "shin": 0.0465, "foot": 0.0145,
+}  # fmt: skip
+UPPER, FORE, THIGH, SHIN = 0.436, 0.430, 0.433, 0.433  # [Winter09, table 4.1]: where a limb's mass is, from its origin
+PELVIS = {"bow": 0.55, "tilt": 0.2, "turn": 0.35}  # the pelvis' share of the trunk's angles
+BEARS = 0.15  # weight on a foot in the air, to one on the floor: a quick step is not waited for
+SWAY = 0.30  # s: half of the time over which the weight changes feet
+STEP = (0.04, 0.12)  # m, and of its length: how high a foot is carried in a step
+FLIES = (0.4, 0.3)  # of a jump's move, and s at most: in the air
+
+
+@dataclass(frozen=True)
+class Exercise:
+    """One exercise.
+
+    seconds : range of a repetition's length; moves : (share of it, the pose's channels that differ from `base`; None
+    holds the pose), where a name of FOOT or ARM means both sides, `_near` and `_far` sides that change with every
+    repetition, as do the signs of tilt and turn, if it is `mirrored`; base : the pose it starts from; jumps : every
+    move is a jump; wanders : m, how far a repetition may step aside"""
+
+    seconds: tuple[float, float]
+    moves: tuple
+    base: dict | None = None
+    mirrored: bool = False
+    jumps: bool = False
+    wanders: float = 0.0
+
+
+GUARD = {"ahead_l": 0.16, "ahead_r": -0.14, "out": 0.13, "dip": 0.04, "flex": 50, "elbow": 125, "inward": 25, "bow": 8}
+WINGS = {"out": 0.28, "abd": 85, "elbow": 4}
+BACK: dict = {}  # to the base
+TOES = {"bow": 108, "flex": 100, "elbow": 4, "dip": 0.05}
+SQUAT = {"dip": 0.30, "bow": 38, "flex": 95, "elbow": 5}
+ONE_FOOT = {"bow": 98, "turn": 35, "flex_far": 100, "abd_far": 10, "flex_near": -30, "abd_near": 50, "dip": 0.04}
+PICKS_UP = {"ahead_near": 0.22, "bow": 72, "turn": 20, "dip": 0.24, "flex_near": 85, "elbow_near": 8, "flex_far": 20}
+STEPPED = {"ahead_near": 0.62, "toe_far": -35, "dip": 0.10}
+DEEP = STEPPED | {"toe_far": -48, "dip": 0.30, "bow": 8}
+KNEE = {"up_near": 0.36, "ahead_near": 0.16, "toe_near": -15, "flex_far": 45, "elbow": 80}
+PUNCH = {"flex_near": 88, "elbow_near": 12, "inward_near": 40, "turn": -28, "bow": 14}
+EXERCISES = {
+    "bend": Exercise((2.0, 4.5), ((0.2, {"flex": 165, "elbow": 5}), (0.35, TOES), (0.1, None), (0.35, BACK))),
+    "squat": Exercise((1.6, 3.5), ((0.45, SQUAT), (0.1, None), (0.45, BACK))),
+    "windmill": Exercise((1.4, 3.0), ((0.45, ONE_FOOT), (0.1, None), (0.45, BACK)), WINGS, True),
+    "pick": Exercise((1.8, 3.5), ((0.4, PICKS_UP), (0.15, None), (0.45, BACK)), mirrored=True, wanders=0.15),
+    "jack": Exercise((0.9, 1.4), ((0.5, {"out": 0.34, "abd": 150, "elbow": 20}), (0.5, BACK)), jumps=True),
+    "hop": Exercise((0.5, 0.8), ((1.0, {"elbow": 50}),), {"elbow": 40}, jumps=True, wanders=0.08),
+    "lunge": Exercise((2.4, 4.2), ((0.3, STEPPED), (0.2, DEEP), (0.2, STEPPED), (0.3, BACK)), mirrored=True),
+    "raise": Exercise((0.8, 1.8), ((0.5, KNEE), (0.5, BACK)), mirrored=True),
+    "box": Exercise((0.45, 1.1), ((0.35, PUNCH), (0.65, BACK)), GUARD, mirrored=True, wanders=0.20),
+}
+MIX = tuple((kind, {}) for kind in EXERCISES)  # of `library`: nine in turn, so that of 20 clips none is always held out
+
+
+def _pose(base, changes, near) -> np.ndarray:
+    """(c,) in the order of CHANNELS: what is common to both sides first, then what a side has of its own."""
+    far = "r" if near == "l" else "l"
+    out = dict.fromkeys(CHANNELS, 0.0)
+    for one in (STANDS, base, changes):
+        for name, value in one.items():
+            if name in (*FOOT, *ARM):
+                out[f"{name}_l"] = out[f"{name}_r"] = value
+        for name, value in one.items():
+            if name in ("tilt", "turn"):
+                out[name] = value if near == "l" else -value
+            elif name not in (*FOOT, *ARM):
+                out[name.replace("_near", f"_{near}").replace("_far", f"_{far}")] = value
+    return np.array(list(out.values()))
+
+
+@dataclass
+class _Keys:
+    """(k,) key poses in time; `_repeat` makes them, `_between` is what lies between them."""
+
+    times: np.ndarray  # s
+    poses: np.ndarray  # (k, c) in the order of CHANNELS
+    places: np.ndarray  # (k, 2) of the middle between the feet, ahead and to the left [m]
+    jumps: np.ndarray  # whether one jumps to get there
+
+
+def _repeat(one: Exercise, duration, rng, variation) -> _Keys:
+    """An exercise over and over: bouts of repetitions, and pauses.
+
+    A bout has 3 to 8 of them, a pause 0.5 to 2 s.  A repetition is 0.6 to 1.1 times as far as EXERCISES says and, if
+    mirrored, to the other side than the one before; who wanders does so in 0.3 of them, and takes sides by chance."""
+    base, near = one.base or {}, "l"
+    stand = _pose(base, {}, near)
+    now, place = rng.uniform(0.8, 1.6), np.zeros(2)
+    keys = [(0.0, stand, place, False)]
+    while now < duration:
+        for _ in range(rng.integers(3, 9)):
+            far = 1.0 - variation * rng.uniform(-0.1, 0.4)
+            near = str(rng.choice(["l", "r"])) if one.wanders else "lr"[near == "l"]
+            if one.wanders and rng.uniform() < 0.3:
+                place = np.clip(place + rng.uniform(-one.wanders, one.wanders, 2), -0.5, 0.5)
+            length = rng.uniform(*one.seconds)
+            keys.append((now, *keys[-1][1:3], False))
+            for share, changes in one.moves:
+                now += share * length
+                goal = keys[-1][1] if changes is None else stand + far * (_pose(base, changes, near) - stand)
+                keys.append((now, goal, place, one.jumps))
+        now += rng.uniform(0.5, 2.0)
+    return _Keys(*map(np.array, zip(*keys, strict=True)))
+
+
+def _between(keys: _Keys, t):
+    """What lies between the keys, minimum-jerk [Flash85].
+
+    A foot that is put elsewhere is lifted by STEP; if both are, one after the other.  In a jump the knees bend, both
+    feet leave the floor and fly as a stone does, for FLIES of the move, and the knees bend again.
+    Equation  up(t) = g (t - a) (b - t) / 2 in a flight from a to b; before it, for G seconds, the pelvis sinks by
+              v G u² (1 - u), u from 0 to 1, so that it leaves with the speed v = g (b - a) / 2; after it in reverse
+    Returns   poses (T, c); feet (T, 2, 3) left, right: ahead, to the left, above the floor [m]; flight (T,): of it what
+              a jump is, and sinks (T,): how far the pelvis goes down before and after [m]"""
+    k = np.clip(np.searchsorted(keys.times, t, side="right") - 1, 0, len(keys.times) - 2)
+    span = np.maximum(keys.times[k + 1] - keys.times[k], 1e-9)
+    s, jumps = np.clip((t - keys.times[k]) / span, 0.0, 1.0), keys.jumps[k + 1]
+    air = np.minimum(FLIES[0], FLIES[1] / span)  # of the move
+    aloft = np.clip((s - 0.5) / air + 0.5, 0.0, 1.0)
+    flight = np.where(jumps, 0.5 * GRAVITY * (air * span) ** 2 * aloft * (1 - aloft), 0.0)
+    ground = 0.5 * (1 - air)  # of the move, before and after
+    u = np.clip(np.minimum(s, 1 - s) / ground, 0.0, 1.0)
+    sinks = np.where(jumps, 0.5 * GRAVITY * air * ground * span**2 * u * u * (1 - u), 0.0)
+    mix = lambda values, go: values[k] + (values[k + 1] - values[k]) * go[:, None]  # noqa: E731
+    poses = mix(keys.poses, smooth(s))
+    at = [keys.places + keys.poses[:, [CHANNELS.index(f"{name}_{e}") for name in ("ahead", "out")]] * [1, sign]
+          for e, sign in (("l", 1), ("r", -1))]  # fmt: skip
+    far = [np.linalg.norm(p[k + 1] - p[k], axis=1) for p in at]
+    both = (np.minimum(*far) > 0.01) & ~jumps
+    feet = np.zeros((len(t), 2, 3))
+    for j, e in enumerate("lr"):
+        own = np.where(both, np.clip(2 * s - j, 0.0, 1.0), s)
+        feet[:, j, :2] = mix(at[j], smooth(np.where(jumps, aloft, own)))
+        step = np.where(far[j] > 0.01, STEP[0] + STEP[1] * far[j], 0.0) * 16 * own**2 * (1 - own) ** 2
+        feet[:, j, 2] = poses[:, CHANNELS.index(f"up_{e}")] + np.where(jumps, flight, step)
+    return poses, feet, flight, sinks
+
+
+def _feet(body, poses, feet):
+    """World poses of both feet, as `gait.pose_legs` takes them; a foot with its toes down stands on its ball."""
+    out = []
+    for j, e in enumerate("lr"):
+        rot = about("y", -poses[:, CHANNELS.index(f"toe_{e}")] * DEG)
+        ankle = feet[:, j] + [0, 0, body.ankle_height] + body.ball - rotate(rot, body.ball)
+        out.append((ankle, rot, np.zeros(len(poses))))
+    return out
+
+
+def center_of_mass(poss, ball):
+    r"""Of the whole body, of the segments' masses.
+
+    Equation  c = Σ mᵢ xᵢ / Σ mᵢ [Winter09, table 4.1]
+    Where     the trunk's lies half-way from the hips to the shoulders, the head's in its joint, a hand's in the wrist,
+              a foot's half-way from the ankle to the ball
+    Args      poss : dict of SEGMENTS, (T, 3) each; ball (T, 2, 3)
+    Returns   (T, 3)
+    Test      tests/mocap/test_exercise.py::test_center_of_mass
+    """
+    shoulders = 0.5 * (poss["upper_arm_l"] + poss["upper_arm_r"])
+    parts = [(MASSES["trunk"], 0.5 * (poss["pelvis"] + shoulders)), (MASSES["head"], poss["head"])]
+    for j, e in enumerate("lr"):
+        for name, share, end in (("upper_arm", UPPER, "forearm"), ("forearm", FORE, "hand"), ("thigh", THIGH, "shin"),
+                                 ("shin", SHIN, "foot")):  # fmt: skip
+            parts.append((MASSES[name], (1 - share) * poss[f"{name}_{e}"] + share * poss[f"{end}_{e}"]))
+        parts += [(MASSES["hand"], poss[f"hand_{e}"]), (MASSES["foot"], 0.5 * (poss[f"foot_{e}"] + ball[:, j]))]
+    return sum(m * x for m, x in parts) / sum(m for m, _ in parts)
+
+
+def _bearing(body, feet, flight, rate):
+    """Where the weight rests (T, 2): between the feet on the floor, on its way to the next a little before."""
+    bears = np.where(feet[..., 2] - flight[:, None] > 1e-3, BEARS, 1.0)
+    bears /= bears.sum(1, keepdims=True)
+    middle = 0.5 * (body.heel[0] + body.ball[0])
+    rests = (bears[..., None] * (feet[..., :2] + [middle, 0])).sum(1)
+    kernel = np.hanning(2 * max(int(SWAY * rate), 1) + 3)[1:-1]
+    return convolve1d(rests, kernel / kernel.sum(), axis=0, mode="nearest")
+
+
+def _height(body, xy, r_pelvis, feet, flight, rate):
+    """Of the pelvis above its `xy`, as high as the legs reach, without the jump (T,) [m]."""
+    reach = np.sqrt(body.thigh**2 + body.shin**2 + 2 * body.thigh * body.shin * np.cos(6 * DEG))
+    limits = []
+    for hip, (ankle, _, _) in zip(hips_of(body, np.column_stack([xy, 0 * flight]), r_pelvis), feet, strict=True):
+        flat = np.sum((hip - ankle)[:, :2] ** 2, 1)
+        limits.append(ankle[:, 2] - flight + np.sqrt(np.maximum(reach**2 - flat, 0.2 * reach**2)) - hip[:, 2])
+    return lowered(body.thigh + body.shin + body.ankle_height, np.min(limits, axis=0), rate, half=0.15)
+
+
+def generate(kind, duration, rate=30.0, seed=0, height=1.75, variation=1.0):
+    r"""One clip of somebody who does an exercise.
+
+    Equation  none: key poses, minimum-jerk, two-bone legs, and the pelvis where c_xy = `_bearing` (four times moved by
+              what is missing), as high as the legs reach less the pose's dip
+    Args      kind : one of EXERCISES; duration [s]; rate [1/s]; seed : int; height : stature [m]; variation : 0 repeats
+              the exercise as EXERCISES says, 1 is natural
+    Returns   as `mocap.gait.generate`
+    Raises    ValueError: unknown kind, or a value that makes no motion
+    Test      tests/mocap/test_exercise.py
+    """
+    if kind not in EXERCISES:
+        raise ValueError(f"exercise {kind!r}: valid are {', '.join(EXERCISES)}")
+    if duration * rate < 2 or height <= 0:
+        raise ValueError(f"duration {duration}, rate {rate}, height {height}: must be positive")
+    rng, body, size = np.random.default_rng(seed), Body(height), height / 1.75
+    t = np.arange(round(duration * rate)) / rate
+    poses, feet, flight, sinks = _between(_repeat(EXERCISES[kind], duration, rng, variation), t)
+    restless = {"bow": 1.5, "tilt": 1.0, "turn": 2.0, "nod": 4.0, "look": 8.0}  # deg
+    restless |= {f"{name}_{e}": 3.0 for e in "lr" for name in ARM}
+    for name, much in restless.items():
+        poses[:, CHANNELS.index(name)] += much * variation * noise(rng, t, 0.4)
+    feet[:, :, :2] *= size
+    feet[:, :, 2] = flight[:, None] + size * (feet[:, :, 2] - flight[:, None])
+    p = {name: poses[:, i] * (size if name == "dip" else DEG) for i, name in enumerate(CHANNELS)}
+    turned = lambda k: about("z", k["turn"]) @ about("y", k["bow"]) @ about("x", -k["tilt"])  # noqa: E731
+    rots = {
+        "pelvis": turned({name: share * p[name] for name, share in PELVIS.items()}),
+        "chest": turned(p),
+        "head": turned(
+            {"turn": 0.6 * p["turn"] + p["look"], "bow": 0.8 * p["bow"] + p["nod"], "tilt": 0.6 * p["tilt"]}
+        ),
+    }
+    on_floor, rests = _feet(body, poses, feet), _bearing(body, feet, flight, rate)
+    arms = np.stack([np.stack([p[f"{name}_{e}"] for name in ARM], 1) for e in "lr"], 1)
+    path, xy = SimpleNamespace(t=t, psi=0 * t), rests
+    for _ in range(5):
+        z = _height(body, xy, rots["pelvis"], on_floor, flight, rate) + flight - sinks - p["dip"]
+        poss = {"pelvis": np.concatenate([xy, z[:, None]], 1)}
+        poss["chest"] = poss["pelvis"] + rotate(rots["pelvis"], body.chest)
+        poss["head"] = poss["chest"] + rotate(rots["chest"], body.head)
+        ball = pose_legs(body, path, on_floor, PELVIS["turn"] * p["turn"], rots, poss)
+        pose_arms(body, arms, None, rots, poss)
+        xy = xy + rests - center_of_mass(poss, ball)[:, :2]
+    quat = np.stack([Rotation.from_matrix(rots[k]).as_quat(scalar_first=True) for k in SEGMENTS], 1)
+    return {
+        "pos": np.stack([poss[k] for k in SEGMENTS], 1),
+        "quat": continuous(quat),
+        "ball": ball,
+        "rate": float(rate),
+        "name": f"{kind}_{seed}",
+    }
+
+
+def library(minutes=10.0, rate=30.0, seed=0, mix=MIX):
+    r"""An embedded data set: clips of 20 to 40 s of every exercise in turn, byte-identical for a seed.
+
+    Args      minutes : total length; rate [1/s]; seed : int; mix : (kind, parameters of `generate`) in turn
+    Returns   list of clips as `generate` returns them; heights 1.5 to 1.9 m
+    Test      tests/mocap/test_exercise.py::test_library
+    """
+    rng = np.random.default_rng(seed)
+    clips = []
+    for i in range(max(1, round(minutes * 2))):
+        kind, params = mix[i % len(mix)]
+        seconds, own, height = rng.uniform(24.0, 36.0), int(rng.integers(2**31)), float(rng.uniform(1.5, 1.9))
+        made = generate(kind, seconds, rate, own, **{"height": height, **params})
+        clips.append({**made, "name": f"{i:02d}_{kind}"})
+    return clips
