@@ -6,7 +6,7 @@ r"""The headline by one command: every set of captures, streamed, a row each; al
 
     SETS ──► captures ──► metrics.streamed ──► a row a set ──► together ──► README.md's and RESULTS.md's tables
     recordings, a user who does not move ──► users.row_of_streams ──► a row a source
-    rounds: streams ──► worn_otherwise ──► users.row_of_streams ──► a row a set
+    rounds: streams ──► put_off ──► users.row_of_streams ──► a row a set
 
 `--mocap` holds the folders bandai, cmu, bandai-standing, bandai-actions, cmu-inplace and cmu-dance-karate; a set whose
 folder is not there is left out, and says so.  Choose on one half (`--half select`), report the other.
@@ -32,12 +32,12 @@ from headset.player import Player, stream_of
 from headset.reader import Sample, sound
 from human import sensors
 from mocap.data import CONTROL_RATE
-from plumbing.cli import COUNT, THREADS, UserError, arg, cell, cli, markdown, run_main
+from plumbing.cli import THREADS, UserError, arg, cell, cli, markdown, run_main
 from plumbing.files import atomic_write, check_folders
 from policy import check_fits, devices_of, find_policy, load_character
 
 HALVES = [half for half in metrics.HALVES if half != "both"]
-PUT, SHAKEN = 0.012, 0.002  # m, ASSUMED: where a device sits, in another round, and from one tick to the next
+PUT, SHAKEN = 0.012, 0.002  # m, ASSUMED standard deviations of a position error: of a round, of a tick
 
 
 @dataclass
@@ -63,17 +63,18 @@ SETS = (
     Set("CMU 61: salsa", "cmu-dance-karate/validation", "all"),
     Set("built-in: start, stop, turn, sidestep, …", "builtin"),
     Set("built-in: stand, strike, crouch, step", "standing"),
-    Set("built-in: toe touches, squats, lunges, jumps, boxing", "exercises"),
+    Set("built-in: exercises in place", "exercises"),
 )
 TRAINED = (  # what is hard of the training sets: there is more of it than is held out
     Set("steps back", "backwards", "train"),
     Set("actions", "bandai-actions/train", "all"),
     Set("exercises in place", "cmu-inplace/train", "all"),
     Set("dance, martial arts", "cmu-dance-karate/train", "all"),
-    Set("built-in: toe touches, squats, lunges, jumps, boxing", "exercises", "train"),
+    Set("built-in: exercises in place", "exercises", "train"),
     Set("built-in: sidesteps, stops", "builtin", "train", "s[it][do][ep]*"),
     Set("built-in, standing: sidesteps, stops", "standing", "train", "s[it][do][ep]*"),
 )
+ROUNDS = (lambda v: 1 <= v <= 100, "from 1 to 100")
 MINUTE = 62.0  # s of the user who does not move, of which the first second calibrates
 COLUMNS = (
     ("clips", "captures", "{:d}"),
@@ -101,7 +102,9 @@ class Options:
         "which captures: select, on which policies are chosen; report, the rest; train, hard ones of the training sets",
         ("train", *HALVES),
     )
-    rounds: int = arg(1, "play all this often: as it is, then with devices put otherwise; shorter rows", check=COUNT)
+    rounds: int = arg(
+        1, "play captures this often: as they are, then with position errors; fewer columns", check=ROUNDS
+    )
     json: str | None = arg(None, "write the tables here")
     threads: int = arg(0, "physics threads, 0 = all cores", check=THREADS)
 
@@ -119,12 +122,16 @@ def captures_of(one: Set, folder: Path, half: str) -> list:
     return metrics.captures_of(metrics.Options(motion=motion, clips=one.clips, half=half, **how))
 
 
-def worn_otherwise(streams, rounds: int) -> list:
-    """Every stream as often as there are rounds: in the first as it is, later with devices that sit otherwise.
+def put_off(streams, rounds: int) -> list:
+    """Every stream once for each round: first as it is, then with position errors of its own.
 
     One capture more or less is chance; the failures of several rounds tell a better policy from a lucky one.
-    Method    p' = p + e + n, e ~ N(0, PUT²) of each device for the whole stream, n ~ N(0, SHAKEN²) of every tick
-    Test      tests/extras/test_streamed.py::test_worn_otherwise"""
+    Equation  p' = p + e + n, e ~ N(0, PUT²) for each device and axis, the same all along a stream; n ~ N(0, SHAKEN²) at
+              every tick
+    Frame     the character's world, after calibration: e does not turn with the device
+    Args      streams : (pos (T, devices, 3) [m], quat (T, devices, 4)) of each; rounds : int >= 1
+    Returns   rounds × len(streams) of them; the same errors at every call, so that policies compare
+    Test      tests/extras/test_streamed.py::test_put_off"""
     out = list(streams)
     for k in range(1, rounds):
         rng = np.random.default_rng([7, k])
@@ -182,7 +189,7 @@ def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, d
     def row_of(drive, clips):
         if opt.rounds == 1:
             return metrics.streamed(char, drive, clips, devices, opt.threads)
-        several = worn_otherwise([stream_of(char, clip, devices)[:2] for clip in clips], opt.rounds)
+        several = put_off([stream_of(char, clip, devices)[:2] for clip in clips], opt.rounds)
         row = row_of_streams(char, drive, several, devices, opt.threads)
         return row | {"clips": row["captures"]}
 

@@ -2,7 +2,7 @@ r"""Human motion: one canonical human, whatever the rig  [Reda23 §3.4, App. A].
 
     read a file ──────► canonical Clip ──► resample ──► stitch ──► sensors, contacts
     (mocap/rigs.py)           15 segments        30 Hz        ≥ 30 s     §3.4    App. A
-    or mocap/gait.py
+    or mocap/gait.py, mocap/exercise.py
 
 Everything after the reader speaks of one human only: 15 named segments, each with a joint centre and an
 anatomical frame that equals the world's axes (x forward, y left, z up) when the person stands upright with
@@ -123,13 +123,13 @@ def builtin_clips(rate=CONTROL_RATE, seed=0, name="builtin") -> list[Clip]:
     forwards, `mocap.augment.reverse`d), all of mocap/gait.py, or exercise in place (exercises, mocap/exercise.py).
 
     Twenty clips, two of them held out by their numbers; and ten more, of every kind and by other people, all held out.
-    Test      tests/mocap/test_mocap.py::test_builtin, ::test_joined"""
+    Test      tests/mocap/test_mocap.py::test_builtin, ::test_joined, tests/mocap/test_exercise.py::test_library"""
     mix, out = BUILTIN[name], []
     library_of = exercise.library if name == "exercises" else gait.library
     library = library_of(rate=rate, seed=seed, mix=mix)
     each = tuple({kind: (kind, ranges) for kind, ranges in reversed(mix)}.values())  # one of every kind
     held_out = library_of(minutes=5.0, rate=rate, seed=seed + 1000, mix=each)
-    numbers = [(i + 5) % len(library) for i in range(len(library))]  # so that 005 and 015 are straight walks
+    numbers = [(i + 5) % len(library) for i in range(len(library))]  # of `builtin` 005 and 015 are straight walks
     numbers += [105 + 10 * i for i in range(len(held_out))]
     for m, number in zip(library + held_out, numbers, strict=True):
         title = f"{m['name'].split('_')[1]}_{number:03d}"

@@ -1,7 +1,7 @@
 r"""Built-in motions of people who exercise in place: squats, toe touches, lunges, jumping jacks, boxing.
 
     EXERCISES ──► _repeat: keys, one repetition after the other ──► _between ──► a pose at every frame
-    pose ──► feet on the floor, trunk and arms by their angles ──► _balanced: the pelvis ──► legs by two-bone IK
+    pose ──► feet on the floor, trunk and arms by their angles ──► the pelvis by balance ──► legs by two-bone IK
 
 A headset sinks by half its height when its user touches the toes, and flies when they jump, and neither is in a walk.
 An exercise is a few key poses, min-jerk between them [Flash85], again and again, larger and smaller, quicker and
@@ -15,7 +15,6 @@ ASSUMED   the poses and the numbers below that name no source: gymnastics as tau
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import numpy as np
 from scipy.ndimage import convolve1d
@@ -37,9 +36,10 @@ from mocap.gait import (
     smooth,
 )
 
-# A pose.  Trunk [deg]: bow forwards, tilt and turn to the left; nod and look of the head beside it.  dip: how far the
-# pelvis sinks.  Feet, left and right: ahead, out to its side, up [m at 1.75 m of height], toe up [deg].  Arms as in
-# mocap/gait.py [deg]: flexion, abduction, inward rotation, elbow.
+# A pose.  Trunk [deg]: bow forwards, tilt to the left, turn to the left about the vertical (a bowed trunk swings to
+# that side, it does not twist); nod and look of the head beside it; dip [m]: how far the pelvis sinks.  Feet, left and
+# right: ahead, out to its side, up [m], toe up [deg].  Arms as in mocap/gait.py [deg]: flexion, abduction, inward
+# rotation, elbow.  All metres are those of a person of 1.75 m.
 TRUNK = ("bow", "tilt", "turn", "nod", "look", "dip")
 FOOT, ARM = ("ahead", "out", "up", "toe"), ("flex", "abd", "inward", "elbow")
 CHANNELS = (*TRUNK, *(f"{name}_{e}" for e in "lr" for name in (*FOOT, *ARM)))
@@ -50,10 +50,12 @@ MASSES = {  # [Winter09, table 4.1], as shares of the whole body's; of a limb on
 }  # fmt: skip
 UPPER, FORE, THIGH, SHIN = 0.436, 0.430, 0.433, 0.433  # [Winter09, table 4.1]: where a limb's mass is, from its origin
 PELVIS = {"bow": 0.55, "tilt": 0.2, "turn": 0.35}  # the pelvis' share of the trunk's angles
-BEARS = 0.15  # weight on a foot in the air, to one on the floor: a quick step is not waited for
+HEAD = {"bow": (0.8, "nod"), "tilt": (0.6, None), "turn": (0.6, "look")}  # and the head's, and what it adds
+BEARS = 0.15  # a lifted foot's weight to a standing one's: for a quick step the trunk does not shift all the way
 SWAY = 0.30  # s: half of the time over which the weight changes feet
-STEP = (0.04, 0.12)  # m, and of its length: how high a foot is carried in a step
-FLIES = (0.4, 0.3)  # of a jump's move, and s at most: in the air
+STEP = (0.04, 0.12)  # a foot is lifted by so many metres, and by this share of the step's length
+FLIES = (0.4, 0.3)  # share of a jump's move spent in the air, and at most so many seconds
+STRAIGHT, SOFT = 6 * DEG, 0.15  # the straightest knee; s: as long before and after the pelvis gives way to short legs
 
 
 @dataclass(frozen=True)
@@ -62,13 +64,12 @@ class Exercise:
 
     seconds : range of a repetition's length; moves : (share of it, the pose's channels that differ from `base`; None
     holds the pose), where a name of FOOT or ARM means both sides, `_near` and `_far` sides that change with every
-    repetition, as do the signs of tilt and turn, if it is `mirrored`; base : the pose it starts from; jumps : every
-    move is a jump; wanders : m, how far a repetition may step aside"""
+    repetition, as does the sign of turn; base : the pose it starts from; jumps : every move is a jump; wanders : m, how
+    far a repetition may step in any direction"""
 
     seconds: tuple[float, float]
     moves: tuple
     base: dict | None = None
-    mirrored: bool = False
     jumps: bool = False
     wanders: float = 0.0
 
@@ -87,15 +88,16 @@ PUNCH = {"flex_near": 88, "elbow_near": 12, "inward_near": 40, "turn": -28, "bow
 EXERCISES = {
     "bend": Exercise((2.0, 4.5), ((0.2, {"flex": 165, "elbow": 5}), (0.35, TOES), (0.1, None), (0.35, BACK))),
     "squat": Exercise((1.6, 3.5), ((0.45, SQUAT), (0.1, None), (0.45, BACK))),
-    "windmill": Exercise((1.4, 3.0), ((0.45, ONE_FOOT), (0.1, None), (0.45, BACK)), WINGS, True),
-    "pick": Exercise((1.8, 3.5), ((0.4, PICKS_UP), (0.15, None), (0.45, BACK)), mirrored=True, wanders=0.15),
+    "windmill": Exercise((1.4, 3.0), ((0.45, ONE_FOOT), (0.1, None), (0.45, BACK)), WINGS),
+    "pick": Exercise((1.8, 3.5), ((0.4, PICKS_UP), (0.15, None), (0.45, BACK)), wanders=0.15),
     "jack": Exercise((0.9, 1.4), ((0.5, {"out": 0.34, "abd": 150, "elbow": 20}), (0.5, BACK)), jumps=True),
     "hop": Exercise((0.5, 0.8), ((1.0, {"elbow": 50}),), {"elbow": 40}, jumps=True, wanders=0.08),
-    "lunge": Exercise((2.4, 4.2), ((0.3, STEPPED), (0.2, DEEP), (0.2, STEPPED), (0.3, BACK)), mirrored=True),
-    "raise": Exercise((0.8, 1.8), ((0.5, KNEE), (0.5, BACK)), mirrored=True),
-    "box": Exercise((0.45, 1.1), ((0.35, PUNCH), (0.65, BACK)), GUARD, mirrored=True, wanders=0.20),
+    "lunge": Exercise((2.4, 4.2), ((0.3, STEPPED), (0.2, DEEP), (0.2, STEPPED), (0.3, BACK))),
+    "raise": Exercise((0.8, 1.8), ((0.5, KNEE), (0.5, BACK))),
+    "box": Exercise((0.45, 1.1), ((0.35, PUNCH), (0.65, BACK)), GUARD, wanders=0.20),
 }
-MIX = tuple((kind, {}) for kind in EXERCISES)  # of `library`: nine in turn, so that of 20 clips none is always held out
+# Of `library`: nine, not ten, as clips 0 and 10 are held out (`mocap.data.builtin_clips`) and would be all of one kind.
+MIX = tuple((kind, {}) for kind in EXERCISES)
 
 
 def _pose(base, changes, near) -> np.ndarray:
@@ -107,7 +109,7 @@ def _pose(base, changes, near) -> np.ndarray:
             if name in (*FOOT, *ARM):
                 out[f"{name}_l"] = out[f"{name}_r"] = value
         for name, value in one.items():
-            if name in ("tilt", "turn"):
+            if name == "turn":
                 out[name] = value if near == "l" else -value
             elif name not in (*FOOT, *ARM):
                 out[name.replace("_near", f"_{near}").replace("_far", f"_{far}")] = value
@@ -127,8 +129,9 @@ class _Keys:
 def _repeat(one: Exercise, duration, rng, variation) -> _Keys:
     """An exercise over and over: bouts of repetitions, and pauses.
 
-    A bout has 3 to 8 of them, a pause 0.5 to 2 s.  A repetition is 0.6 to 1.1 times as far as EXERCISES says and, if
-    mirrored, to the other side than the one before; who wanders does so in 0.3 of them, and takes sides by chance."""
+    A bout has 3 to 8 of them, a pause 0.5 to 2 s.  A repetition is 0.6 to 1.1 times as far as EXERCISES says (a
+    jump as high as its time allows), to the other side than the one before; who wanders does so in 0.3 of them, and
+    takes sides by chance."""
     base, near = one.base or {}, "l"
     stand = _pose(base, {}, near)
     now, place = rng.uniform(0.8, 1.6), np.zeros(2)
@@ -156,10 +159,10 @@ def _between(keys: _Keys, t):
     feet leave the floor and fly as a stone does, for FLIES of the move, and the knees bend again.
     Equation  up(t) = g (t - a) (b - t) / 2 in a flight from a to b; before it, for G seconds, the pelvis sinks by
               v G u² (1 - u), u from 0 to 1, so that it leaves with the speed v = g (b - a) / 2; after it in reverse
-    Returns   poses (T, c); feet (T, 2, 3) left, right: ahead, to the left, above the floor [m]; flight (T,): of it what
-              a jump is, and sinks (T,): how far the pelvis goes down before and after [m]"""
+    Returns   poses (T, c); feet (T, 2, 3) left, right: ahead, to the left, above the floor [m]; flight (T,): how
+              much of the feet's height is the jump's, and sinks (T,): how far the pelvis goes down around it [m]"""
     k = np.clip(np.searchsorted(keys.times, t, side="right") - 1, 0, len(keys.times) - 2)
-    span = np.maximum(keys.times[k + 1] - keys.times[k], 1e-9)
+    span = keys.times[k + 1] - keys.times[k]
     s, jumps = np.clip((t - keys.times[k]) / span, 0.0, 1.0), keys.jumps[k + 1]
     air = np.minimum(FLIES[0], FLIES[1] / span)  # of the move
     aloft = np.clip((s - 0.5) / air + 0.5, 0.0, 1.0)
@@ -212,9 +215,9 @@ def center_of_mass(poss, ball):
     return sum(m * x for m, x in parts) / sum(m for m, _ in parts)
 
 
-def _bearing(body, feet, flight, rate):
+def _bearing(body, feet, rate):
     """Where the weight rests (T, 2): between the feet on the floor, on its way to the next a little before."""
-    bears = np.where(feet[..., 2] - flight[:, None] > 1e-3, BEARS, 1.0)
+    bears = np.where(feet[..., 2] > 1e-3, BEARS, 1.0)
     bears /= bears.sum(1, keepdims=True)
     middle = 0.5 * (body.heel[0] + body.ball[0])
     rests = (bears[..., None] * (feet[..., :2] + [middle, 0])).sum(1)
@@ -223,22 +226,22 @@ def _bearing(body, feet, flight, rate):
 
 
 def _height(body, xy, r_pelvis, feet, flight, rate):
-    """Of the pelvis above its `xy`, as high as the legs reach, without the jump (T,) [m]."""
-    reach = np.sqrt(body.thigh**2 + body.shin**2 + 2 * body.thigh * body.shin * np.cos(6 * DEG))
+    """The pelvis' height (T,) [m] above its `xy`, the jump not counted: as high as the legs reach."""
+    reach = np.sqrt(body.thigh**2 + body.shin**2 + 2 * body.thigh * body.shin * np.cos(STRAIGHT))
     limits = []
     for hip, (ankle, _, _) in zip(hips_of(body, np.column_stack([xy, 0 * flight]), r_pelvis), feet, strict=True):
         flat = np.sum((hip - ankle)[:, :2] ** 2, 1)
         limits.append(ankle[:, 2] - flight + np.sqrt(np.maximum(reach**2 - flat, 0.2 * reach**2)) - hip[:, 2])
-    return lowered(body.thigh + body.shin + body.ankle_height, np.min(limits, axis=0), rate, half=0.15)
+    return lowered(body.thigh + body.shin + body.ankle_height, np.min(limits, axis=0), rate, half=SOFT)
 
 
 def generate(kind, duration, rate=30.0, seed=0, height=1.75, variation=1.0):
     r"""One clip of somebody who does an exercise.
 
-    Equation  none: key poses, minimum-jerk, two-bone legs, and the pelvis where c_xy = `_bearing` (four times moved by
-              what is missing), as high as the legs reach less the pose's dip
-    Args      kind : one of EXERCISES; duration [s]; rate [1/s]; seed : int; height : stature [m]; variation : 0 repeats
-              the exercise as EXERCISES says, 1 is natural
+    Equation  none: key poses, minimum-jerk, two-bone legs, and the pelvis where c_xy = `_bearing` (four times moved
+              by what is missing), as high as the legs reach less the pose's dip
+    Args      kind : one of EXERCISES; duration [s]; rate [1/s]; seed : int; height : stature [m]; variation : 0, every
+              repetition as far as EXERCISES says and nothing restless, times and places still random; 1 is natural
     Returns   as `mocap.gait.generate`
     Raises    ValueError: unknown kind, or a value that makes no motion
     Test      tests/mocap/test_exercise.py
@@ -261,19 +264,17 @@ def generate(kind, duration, rate=30.0, seed=0, height=1.75, variation=1.0):
     rots = {
         "pelvis": turned({name: share * p[name] for name, share in PELVIS.items()}),
         "chest": turned(p),
-        "head": turned(
-            {"turn": 0.6 * p["turn"] + p["look"], "bow": 0.8 * p["bow"] + p["nod"], "tilt": 0.6 * p["tilt"]}
-        ),
+        "head": turned({name: share * p[name] + p.get(more, 0.0) for name, (share, more) in HEAD.items()}),
     }
-    on_floor, rests = _feet(body, poses, feet), _bearing(body, feet, flight, rate)
+    on_floor, rests = _feet(body, poses, feet), _bearing(body, feet, rate)
     arms = np.stack([np.stack([p[f"{name}_{e}"] for name in ARM], 1) for e in "lr"], 1)
-    path, xy = SimpleNamespace(t=t, psi=0 * t), rests
+    xy = rests
     for _ in range(5):
         z = _height(body, xy, rots["pelvis"], on_floor, flight, rate) + flight - sinks - p["dip"]
         poss = {"pelvis": np.concatenate([xy, z[:, None]], 1)}
         poss["chest"] = poss["pelvis"] + rotate(rots["pelvis"], body.chest)
         poss["head"] = poss["chest"] + rotate(rots["chest"], body.head)
-        ball = pose_legs(body, path, on_floor, PELVIS["turn"] * p["turn"], rots, poss)
+        ball = pose_legs(body, PELVIS["turn"] * p["turn"], on_floor, rots, poss)
         pose_arms(body, arms, None, rots, poss)
         xy = xy + rests - center_of_mass(poss, ball)[:, :2]
     quat = np.stack([Rotation.from_matrix(rots[k]).as_quat(scalar_first=True) for k in SEGMENTS], 1)
@@ -287,11 +288,12 @@ def generate(kind, duration, rate=30.0, seed=0, height=1.75, variation=1.0):
 
 
 def library(minutes=10.0, rate=30.0, seed=0, mix=MIX):
-    r"""An embedded data set: clips of 20 to 40 s of every exercise in turn, byte-identical for a seed.
+    r"""An embedded data set: clips of 24 to 36 s of every exercise in turn, byte-identical for a seed.
 
-    Args      minutes : total length; rate [1/s]; seed : int; mix : (kind, parameters of `generate`) in turn
+    Args      minutes : about the total length, two clips each; rate [1/s]; seed : int;
+              mix : (kind, parameters of `generate`) in turn
     Returns   list of clips as `generate` returns them; heights 1.5 to 1.9 m
-    Test      tests/mocap/test_exercise.py::test_library
+    Test      tests/mocap/test_exercise.py::test_library, test_same_seed_same_bytes
     """
     rng = np.random.default_rng(seed)
     clips = []

@@ -414,7 +414,7 @@ def two_bone_leg(hip, ankle, forward, a, b):
 
 
 def lowered(want, limit, rate, half=0.30):
-    """Lower `want` smoothly so that it never exceeds `limit`: a running maximum, then an average as wide."""
+    """Lower `want` smoothly so that it never exceeds `limit` (T,): a running maximum of ± `half` s, averaged."""
     w = max(int(half * rate), 1)
     over = maximum_filter1d(np.maximum(want - limit, 0.0), 2 * w + 1, mode="nearest")
     kernel = np.hanning(2 * w + 3)[1:-1]
@@ -556,11 +556,10 @@ def _trunk(plan, style, f, vary):
     yaw_chest = 3.5 * DEG * f.amount * stride * vary(0.15) + 0.2 * look
     pitch_chest = (9 if plan.jog else 2.5) * DEG * f.amount + 1 * DEG * f.nod * f.still + 120 * DEG * f.dip
     nod = 2 * DEG + 6 * DEG * f.still * f.nod
+    roll_chest = -0.3 * (roll + lean) - 1.2 * lean
     rots = {
         "pelvis": about("z", f.psi + yaw) @ about("y", pitch) @ about("x", roll),
-        "chest": about("z", f.psi + yaw_chest)
-        @ about("y", pitch_chest)
-        @ about("x", -0.3 * (roll + lean) - 1.2 * lean),
+        "chest": about("z", f.psi + yaw_chest) @ about("y", pitch_chest) @ about("x", roll_chest),
         "head": about("z", f.psi + look) @ about("y", nod) @ about("x", -0.3 * lean),
     }
     return rots, yaw
@@ -588,12 +587,13 @@ def hips_of(body, pelvis, r_pelvis):
     return [pelvis + rotate(r_pelvis, np.array([0, sign * body.hip_half_width, 0])) for sign in (1, -1)]
 
 
-def pose_legs(body, f, feet, yaw, rots, poss):
-    """Thighs, shins and feet, between the pelvis and where the feet are; -> ball joints (T, 2, 3)."""
-    ball = np.zeros((len(f.t), 2, 3))
+def pose_legs(body, heading, feet, rots, poss):
+    """Thighs, shins and feet [world], from the pelvis, its heading (T,) and what `_foot` returns of both; into rots and
+    poss, rotations (T, 3, 3) and origins (T, 3) by segment; -> ball joints (T, 2, 3)."""
+    ball = np.zeros((len(heading), 2, 3))
     hips = hips_of(body, poss["pelvis"], rots["pelvis"])
     for j, (e, hip, (ankle, r_foot, yaw_foot)) in enumerate(zip("lr", hips, feet, strict=True)):
-        aim = 0.5 * (yaw_foot + f.psi + yaw)
+        aim = 0.5 * (yaw_foot + heading)
         thigh, shin = two_bone_leg(hip, ankle, np.stack([np.cos(aim), np.sin(aim), 0 * aim], 1), body.thigh, body.shin)
         rots |= {f"thigh_{e}": thigh, f"shin_{e}": shin, f"foot_{e}": r_foot}
         poss[f"thigh_{e}"] = hip
@@ -604,7 +604,7 @@ def pose_legs(body, f, feet, yaw, rots, poss):
 
 
 def pose_arms(body, angles, wrist, rots, poss):
-    """Upper arms, forearms and hands by their angles; a wrist of None does not turn."""
+    """Upper arms, forearms and hands into rots and poss, by angles (T, 2, 4) as `_arm_base`; wrist None: straight."""
     for j, (e, sign) in enumerate((("l", 1), ("r", -1))):
         flex, abd, inward, elbow = angles[:, j].T
         upper = rots["chest"] @ about("y", -flex) @ about("x", sign * abd) @ about("z", -sign * inward)
@@ -675,7 +675,7 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
     poss = {"pelvis": _pelvis(plan, body, style, f, feet, rots["pelvis"], up, side)}
     poss["chest"] = poss["pelvis"] + rotate(rots["pelvis"], body.chest)
     poss["head"] = poss["chest"] + rotate(rots["chest"], body.head)
-    ball = pose_legs(body, f, feet, yaw, rots, poss)
+    ball = pose_legs(body, f.psi + yaw, feet, rots, poss)
     angles, wrist = _arm_base(plan, f, vary(0.15), rng, p), None
     if kind == "gesture":
         angles = _gestures(angles, f.t, duration, p, rng)

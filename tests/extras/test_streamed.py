@@ -48,20 +48,24 @@ def test_trained_captures(tmp_path):
     assert len(names) == 9 and {n.rpartition("_")[0] for n in names} == {"sidestep", "stop"}
     back = {c.name for c in streamed.captures_of(streamed.TRAINED[0], tmp_path, "train")}
     assert back == {c.name for c in data.load("backwards", split="train")}
+    assert all(s.split == "train" or s.folder.endswith("/train") for s in streamed.TRAINED)
+    assert all("exercises" in {s.folder for s in sets} for sets in (streamed.SETS, streamed.TRAINED))
 
 
-def test_worn_otherwise():
-    """The first round is the streams; later a device is off by as much at every tick, within what it shakes."""
+def test_put_off():
+    """The first round is the streams; later every device of every stream has its own error at all ticks, and shakes."""
     rng = np.random.default_rng(0)
     streams = [(rng.normal(size=(t, 3, 3)), rng.normal(size=(t, 3, 4))) for t in (400, 60)]
-    out = streamed.worn_otherwise(streams, 3)
+    out = streamed.put_off(streams, 3)
     assert len(out) == 6 and all(a is b for a, b in zip(out, streams))
     off = np.stack([np.mean(out[k][0] - streams[0][0], axis=0) for k in (2, 4)])  # (round, device, axis)
-    assert 0.5 * streamed.PUT < off.std() < 2 * streamed.PUT and np.abs(off[0] - off[1]).min() > 0
+    assert 0.5 * streamed.PUT < off.std() < 2 * streamed.PUT and np.unique(off).size == off.size
+    assert np.abs(np.mean(out[3][0] - streams[1][0], axis=0) - off[0]).min() > 1e-4  # the other stream's
     shaken = out[2][0] - streams[0][0] - off[0]
     assert shaken.std() == pytest.approx(streamed.SHAKEN, rel=0.05)
+    assert abs(np.corrcoef(shaken[:, 0].ravel(), shaken[:, 1].ravel())[0, 1]) < 0.15  # of two devices
     assert out[2][1] is streams[0][1]
-    again = streamed.worn_otherwise(streams, 2)
+    again = streamed.put_off(streams, 2)
     assert all(np.array_equal(a[0], b[0]) for a, b in zip(again, out))  # the same noise, for every policy
 
 
@@ -74,13 +78,15 @@ def test_rounds(tmp_path, monkeypatch, capsys):
     words = ["--character", "dino", "--half", "train", "--rounds", "2", "--json", str(out), "--threads", "1"]
     assert streamed.main(words) == 0
     aside, every, limp, _ = json.loads(out.read_text()).values()
-    assert f"{CHARACTER}, dino, training captures, 2 rounds" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"{CHARACTER}, dino, training captures, 2 rounds" in printed
+    assert "| failures |" in printed and "springs" not in printed
     policy, _, _ = metrics.find_policy(metrics.Options(character="dino"))
     char = character.load("dino")
     streams = [stream_of(char, c, 3)[:2] for c in streamed.captures_of(one, tmp_path, "train")]
     still = lambda obs: np.zeros((len(obs), len(char.limits)))  # noqa: E731
     for row, act in ((every, policy.mean_action), (limp, still)):
-        rides = [ride(char, act, [s])[0] for s in streamed.worn_otherwise(streams, 2)]
+        rides = [ride(char, act, [s])[0] for s in streamed.put_off(streams, 2)]
         assert row["clips"] == len(rides) == 2 * len(streams)
         assert row["failures"] == sum(r.failures for r in rides)
         assert row["completed"] == pytest.approx(np.mean([r.failures == 0 for r in rides]))
