@@ -186,12 +186,14 @@ def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, d
     Test      tests/extras/test_streamed.py::test_command, test_rounds"""
     still = lambda obs: np.zeros((len(obs), len(char.limits)))  # noqa: E731
 
+    def counted(drive, several):
+        row = row_of_streams(char, drive, several, devices, opt.threads)
+        return row | {"clips": row["captures"]}
+
     def row_of(drive, clips):
         if opt.rounds == 1:
             return metrics.streamed(char, drive, clips, devices, opt.threads)
-        several = put_off([stream_of(char, clip, devices)[:2] for clip in clips], opt.rounds)
-        row = row_of_streams(char, drive, several, devices, opt.threads)
-        return row | {"clips": row["captures"]}
+        return counted(drive, put_off([stream_of(char, clip, devices)[:2] for clip in clips], opt.rounds))
 
     for title, drive in (("all", act), ("all, no torque", still)):
         rows = []
@@ -202,8 +204,7 @@ def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, d
         if rows:
             yield title, together(rows)
     for name, several in streams.items():
-        row = row_of_streams(char, act, several, devices, opt.threads)
-        yield name, row | {"clips": row["captures"]}
+        yield name, counted(act, several)
 
 
 def main(argv=None) -> int:

@@ -1,7 +1,7 @@
 r"""One capture, many users: mirrored, at another speed, of another build and bearing, standing before and after.
 
-clips ──► augment   mirror, restyle, warp, resize: another person does the same
-      └─► visits    lead: stands still, sets off, does it, stops, stands: what a headset's user does
+    clips ──► augment   mirror, restyle, warp, resize: another person does the same
+          └─► visits    lead: stands still, sets off, does it, stops, stands: what a headset's user does
 """
 
 from __future__ import annotations

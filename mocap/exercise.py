@@ -18,23 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import convolve1d
-from scipy.spatial.transform import Rotation
 
-from human import SEGMENTS
-from mocap.gait import (
-    DEG,
-    GRAVITY,
-    Body,
-    about,
-    continuous,
-    hips_of,
-    lowered,
-    noise,
-    pose_arms,
-    pose_legs,
-    rotate,
-    smooth,
-)
+from mocap.gait import DEG, GRAVITY, Body, about, clip_of, lowered, noise, pose_body, reached, rotate, smooth
 
 # A pose.  Trunk [deg]: bow forwards, tilt to the left, turn to the left about the vertical (a bowed trunk swings to
 # that side, it does not twist); nod and look of the head beside it; dip [m]: how far the pelvis sinks.  Feet, left and
@@ -186,7 +171,7 @@ def _between(keys: _Keys, t):
 
 
 def _feet(body, poses, feet):
-    """World poses of both feet, as `gait.pose_legs` takes them; a foot with its toes down stands on its ball."""
+    """World poses of both feet, as `gait.pose_body` takes them; a foot with its toes down stands on its ball."""
     out = []
     for j, e in enumerate("lr"):
         rot = about("y", -poses[:, CHANNELS.index(f"toe_{e}")] * DEG)
@@ -225,16 +210,6 @@ def _bearing(body, feet, rate):
     return convolve1d(rests, kernel / kernel.sum(), axis=0, mode="nearest")
 
 
-def _height(body, xy, r_pelvis, feet, flight, rate):
-    """The pelvis' height (T,) [m] above its `xy`, the jump not counted: as high as the legs reach."""
-    reach = np.sqrt(body.thigh**2 + body.shin**2 + 2 * body.thigh * body.shin * np.cos(STRAIGHT))
-    limits = []
-    for hip, (ankle, _, _) in zip(hips_of(body, np.column_stack([xy, 0 * flight]), r_pelvis), feet, strict=True):
-        flat = np.sum((hip - ankle)[:, :2] ** 2, 1)
-        limits.append(ankle[:, 2] - flight + np.sqrt(np.maximum(reach**2 - flat, 0.2 * reach**2)) - hip[:, 2])
-    return lowered(body.thigh + body.shin + body.ankle_height, np.min(limits, axis=0), rate, half=SOFT)
-
-
 def generate(kind, duration, rate=30.0, seed=0, height=1.75, variation=1.0):
     r"""One clip of somebody who does an exercise.
 
@@ -269,22 +244,14 @@ def generate(kind, duration, rate=30.0, seed=0, height=1.75, variation=1.0):
     on_floor, rests = _feet(body, poses, feet), _bearing(body, feet, rate)
     arms = np.stack([np.stack([p[f"{name}_{e}"] for name in ARM], 1) for e in "lr"], 1)
     xy = rests
+    standing = body.thigh + body.shin + body.ankle_height
     for _ in range(5):
-        z = _height(body, xy, rots["pelvis"], on_floor, flight, rate) + flight - sinks - p["dip"]
-        poss = {"pelvis": np.concatenate([xy, z[:, None]], 1)}
-        poss["chest"] = poss["pelvis"] + rotate(rots["pelvis"], body.chest)
-        poss["head"] = poss["chest"] + rotate(rots["chest"], body.head)
-        ball = pose_legs(body, PELVIS["turn"] * p["turn"], on_floor, rots, poss)
-        pose_arms(body, arms, None, rots, poss)
-        xy = xy + rests - center_of_mass(poss, ball)[:, :2]
-    quat = np.stack([Rotation.from_matrix(rots[k]).as_quat(scalar_first=True) for k in SEGMENTS], 1)
-    return {
-        "pos": np.stack([poss[k] for k in SEGMENTS], 1),
-        "quat": continuous(quat),
-        "ball": ball,
-        "rate": float(rate),
-        "name": f"{kind}_{seed}",
-    }
+        at = np.column_stack([xy, np.zeros(len(t))])
+        limit = reached(body, at, rots["pelvis"], on_floor, STRAIGHT) - flight
+        at[:, 2] = lowered(standing, limit, rate, half=SOFT) + flight - sinks - p["dip"]
+        posed = pose_body(body, at, PELVIS["turn"] * p["turn"], on_floor, arms, None, rots)
+        xy = xy + rests - center_of_mass(*posed[1:])[:, :2]
+    return clip_of(*posed, rate, f"{kind}_{seed}")
 
 
 def library(minutes=10.0, rate=30.0, seed=0, mix=MIX):

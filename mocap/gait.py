@@ -571,28 +571,36 @@ def _pelvis(plan, body, style, f, feet, r_pelvis, up, side):
     back = 0.3 * f.dip
     x, y = plan.xy[plan.pick].T
     pelvis = np.stack([x - s * side - c * back, y + c * side - s * back, 0 * f.t], 1)
-    reach = np.sqrt(body.thigh**2 + body.shin**2 + 2 * body.thigh * body.shin * np.cos(style["knee"]))
-    limits = []
-    for hip, (ankle, _, _) in zip(hips_of(body, pelvis, r_pelvis), feet, strict=True):
-        flat = np.sum((hip - ankle)[:, :2] ** 2, 1)
-        limits.append(ankle[:, 2] + np.sqrt(np.maximum(reach**2 - flat, 0.2 * reach**2)) - hip[:, 2])
     bent = 0.045 * (body.height / 1.75) if plan.jog else 0.0
     want = body.thigh + body.shin + body.ankle_height - bent + up
-    pelvis[:, 2] += lowered(want, np.min(limits, axis=0), plan.rate) - f.dip
+    pelvis[:, 2] += lowered(want, reached(body, pelvis, r_pelvis, feet, style["knee"]), plan.rate) - f.dip
     return pelvis
 
 
-def hips_of(body, pelvis, r_pelvis):
+def reached(body, pelvis, r_pelvis, feet, knee):
+    """How far above `pelvis` (T, 3) it can be (T,) [m] while both legs, their knees at `knee` [rad], reach the feet."""
+    reach = np.sqrt(body.thigh**2 + body.shin**2 + 2 * body.thigh * body.shin * np.cos(knee))
+    limits = []
+    for hip, (ankle, _, _) in zip(_hips(body, pelvis, r_pelvis), feet, strict=True):
+        flat = np.sum((hip - ankle)[:, :2] ** 2, 1)
+        limits.append(ankle[:, 2] + np.sqrt(np.maximum(reach**2 - flat, 0.2 * reach**2)) - hip[:, 2])
+    return np.min(limits, axis=0)
+
+
+def _hips(body, pelvis, r_pelvis):
     """The hip joints, left and right, (T, 3) each."""
     return [pelvis + rotate(r_pelvis, np.array([0, sign * body.hip_half_width, 0])) for sign in (1, -1)]
 
 
-def pose_legs(body, heading, feet, rots, poss):
-    """Thighs, shins and feet [world], from the pelvis, its heading (T,) and what `_foot` returns of both; into rots and
-    poss, rotations (T, 3, 3) and origins (T, 3) by segment; -> ball joints (T, 2, 3)."""
+def pose_body(body, pelvis, heading, feet, angles, wrist, rots):
+    """All segments [world]: trunk and head by their rotations `rots`, legs from the pelvis (T, 3) and its heading (T,)
+    to both feet as `_foot` has them, arms by their angles as `_arm_base` has them; a wrist of None does not turn.
+    Returns   rotations (T, 3, 3) and origins (T, 3) by segment, balls (T, 2, 3)"""
+    rots, poss = dict(rots), {"pelvis": pelvis, "chest": pelvis + rotate(rots["pelvis"], body.chest)}
+    poss["head"] = poss["chest"] + rotate(rots["chest"], body.head)
     ball = np.zeros((len(heading), 2, 3))
-    hips = hips_of(body, poss["pelvis"], rots["pelvis"])
-    for j, (e, hip, (ankle, r_foot, yaw_foot)) in enumerate(zip("lr", hips, feet, strict=True)):
+    for j, (e, hip, foot) in enumerate(zip("lr", _hips(body, pelvis, rots["pelvis"]), feet, strict=True)):
+        ankle, r_foot, yaw_foot = foot
         aim = 0.5 * (yaw_foot + heading)
         thigh, shin = two_bone_leg(hip, ankle, np.stack([np.cos(aim), np.sin(aim), 0 * aim], 1), body.thigh, body.shin)
         rots |= {f"thigh_{e}": thigh, f"shin_{e}": shin, f"foot_{e}": r_foot}
@@ -600,11 +608,6 @@ def pose_legs(body, heading, feet, rots, poss):
         poss[f"shin_{e}"] = hip + rotate(thigh, np.array([0, 0, -body.thigh]))
         poss[f"foot_{e}"] = poss[f"shin_{e}"] + rotate(shin, np.array([0, 0, -body.shin]))
         ball[:, j] = poss[f"foot_{e}"] + rotate(r_foot, body.ball)
-    return ball
-
-
-def pose_arms(body, angles, wrist, rots, poss):
-    """Upper arms, forearms and hands into rots and poss, by angles (T, 2, 4) as `_arm_base`; wrist None: straight."""
     for j, (e, sign) in enumerate((("l", 1), ("r", -1))):
         flex, abd, inward, elbow = angles[:, j].T
         upper = rots["chest"] @ about("y", -flex) @ about("x", sign * abd) @ about("z", -sign * inward)
@@ -615,13 +618,21 @@ def pose_arms(body, angles, wrist, rots, poss):
         poss[f"upper_arm_{e}"] = poss["chest"] + rotate(rots["chest"], body.shoulder * [1, sign, 1])
         poss[f"forearm_{e}"] = poss[f"upper_arm_{e}"] + rotate(upper, np.array([0, 0, -body.upper_arm]))
         poss[f"hand_{e}"] = poss[f"forearm_{e}"] + rotate(fore, np.array([0, 0, -body.forearm]))
+    return rots, poss, ball
 
 
-def continuous(quat):
+def _continuous(quat):
     """(T, s, 4) without jumps between q and -q; the first has w > 0."""
     flip = np.where(np.sum(quat[1:] * quat[:-1], -1) < 0, -1.0, 1.0)
     first = np.where(quat[:1, :, 0] < 0, -1.0, 1.0)
     return quat * np.cumprod(np.concatenate([first, flip]), 0)[..., None]
+
+
+def clip_of(rots, poss, ball, rate, name):
+    """The dict that `generate` returns, of what `pose_body` returns."""
+    quat = np.stack([Rotation.from_matrix(rots[k]).as_quat(scalar_first=True) for k in SEGMENTS], 1)
+    pos = np.stack([poss[k] for k in SEGMENTS], 1)
+    return {"pos": pos, "quat": _continuous(quat), "ball": ball, "rate": float(rate), "name": name}
 
 
 def _asked_for(kind, duration, rate, params) -> GaitParams:
@@ -672,24 +683,13 @@ def generate(kind, duration, rate=30.0, seed=0, **params):
     rots, yaw = _trunk(plan, style, f, vary)
     scale = f.amount if plan.jog else np.minimum(f.amount, 1.1)
     feet = [_foot(plan, body, p, style, sign, scale) for sign in (1, -1)]
-    poss = {"pelvis": _pelvis(plan, body, style, f, feet, rots["pelvis"], up, side)}
-    poss["chest"] = poss["pelvis"] + rotate(rots["pelvis"], body.chest)
-    poss["head"] = poss["chest"] + rotate(rots["chest"], body.head)
-    ball = pose_legs(body, f.psi + yaw, feet, rots, poss)
+    pelvis = _pelvis(plan, body, style, f, feet, rots["pelvis"], up, side)
     angles, wrist = _arm_base(plan, f, vary(0.15), rng, p), None
     if kind == "gesture":
         angles = _gestures(angles, f.t, duration, p, rng)
     if p.strokes:
         angles, wrist = _strokes(angles, f.t, duration, p, play)
-    pose_arms(body, angles, wrist, rots, poss)
-    quat = np.stack([Rotation.from_matrix(rots[k]).as_quat(scalar_first=True) for k in SEGMENTS], 1)
-    return {
-        "pos": np.stack([poss[k] for k in SEGMENTS], 1),
-        "quat": continuous(quat),
-        "ball": ball,
-        "rate": float(rate),
-        "name": f"{kind}_{seed}",
-    }
+    return clip_of(*pose_body(body, pelvis, f.psi + yaw, feet, angles, wrist, rots), rate, f"{kind}_{seed}")
 
 
 # The mix of `library`: kind and the ranges its parameters are drawn from, in an order that covers every kind early.

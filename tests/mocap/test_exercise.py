@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from mocap import data, exercise, gait
 
-INDEX = {name: i for i, name in enumerate(exercise.SEGMENTS)}
+INDEX = {name: i for i, name in enumerate(gait.SEGMENTS)}
 KINDS = list(exercise.EXERCISES)
 
 
