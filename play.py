@@ -538,7 +538,7 @@ def source_of(char: Character, path, devices: int, opt: Options):
 
 
 def ticks_of(char: Character, path, devices: int, opt: Options):
-    """What a recording comes to: pos (T, 3, 3), quat (T, 3, 4) at the control rate, in the character's world.
+    """A recording's pos (T, 3, 3), quat (T, 3, 4) at the control rate, in the character's world; each device's lost s.
 
     Raises    UserError: it cannot be read, or shows no headset for a second
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
@@ -549,7 +549,7 @@ def ticks_of(char: Character, path, devices: int, opt: Options):
     say(how.told, path)
     say(source.times(), path)
     ticks = ticks[: max(1, round(opt.seconds * CONTROL_RATE)) if opt.seconds else None]
-    return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks])
+    return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks]), source.guard.lost()
 
 
 def slides_of(char: Character, ride) -> np.ndarray:
@@ -599,11 +599,12 @@ def play_recordings(char: Character, policy, path, devices: int, opt: Options) -
     read = 1 if opt.sensors == "hmd" else devices
     taken, broken = sound(lambda file: (file, ticks_of(char, file, read, opt)), recordings_of(opt.stream))
     files, streams = zip(*taken, strict=True)
-    rides = ride(char, policy.mean_action, streams, devices, opt.threads)
+    rides = ride(char, policy.mean_action, [s[:2] for s in streams], devices, opt.threads)
     top, many = Path(opt.stream), os.path.isdir(opt.stream)
     names = [str(f.relative_to(top)) if many else f.name for f in files]
     slides = [slides_of(char, r) for r in rides]
-    each = (summary_of([r], [s], read) | {"completed": r.failures == 0} for r, s in zip(rides, slides))
+    lost = [{"lost_s": s[2]} for s in streams]
+    each = (summary_of([r], [s], read) | {"completed": r.failures == 0} | k for r, s, k in zip(rides, slides, lost))
     found = {"files": dict(zip(names, each)), "all": summary_of(rides, slides, read)}
     if opt.json:
         atomic_write(opt.json, json.dumps(found, indent=2, allow_nan=False) + "\n")
@@ -620,7 +621,9 @@ def line_of(name, ends, row) -> str:
     falls = ", ".join(f"{n} {end}" for end, n in sorted(ends.items())) or "no failure"
     hands = "" if row["hands_cm"] is None else f", hands {row['hands_cm']:.1f} cm"
     slide = "" if row["own_slide_cm_s"] is None else f", own slide {row['own_slide_cm_s']:.1f} cm/s"
-    return f"{name}: {row['seconds']:.1f} s, {falls}; head {row['head_cm']:.1f} cm{hands}{slide}"
+    lost = ", ".join(f"{device} {s:.1f} s" for device, s in row.get("lost_s", {}).items() if s)
+    lost = f"; lost: {lost}" if lost else ""
+    return f"{name}: {row['seconds']:.1f} s, {falls}; head {row['head_cm']:.1f} cm{hands}{slide}{lost}"
 
 
 # ------------------------------------------------------------------------------------ command line

@@ -8,6 +8,7 @@ A policy's file holds the weights and the normaliser, and says which character i
 
 from __future__ import annotations
 
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -278,12 +279,29 @@ def find_policy(opt):
 def load_character(opt, meta, path) -> Character:
     """The character that the flags ask for; where they ask for nothing, the policy's own with its variation.
 
-    A flag changes that one thing; another character has none of the policy's variations.
-    Test      tests/test_play.py::test_character_of_the_policy"""
-    own = trained_as(meta, path) or Switches()
+    A flag changes that one thing; another character has none of the policy's variations.  A note on stderr says where
+    the policy has not learnt to move what it is given: sizes agree where limbs and postures do not.
+    Test      tests/test_play.py::test_character_of_the_policy, test_note_on_another_body"""
+    known = trained_as(meta, path)
+    own = known or Switches()
     base = own if opt.character in (None, own.character) else Switches(opt.character)
     given = {k: v for k in ("tail", "scale", "set") if (v := getattr(opt, k)) != getattr(Switches(), k)}
-    return replace(base, **given).load()
+    asked = replace(base, **given)
+    if known and body_of(asked) != body_of(own):
+        now, then = (" ".join(f"--{k} {v}" for k, v in body_of(s).items()) or "no changes" for s in (asked, own))
+        print(f"note: {path} was trained with {then}, and is played with {now}", file=sys.stderr)
+    return asked.load()
+
+
+def body_of(switches: Switches) -> dict:
+    """What flags change in a body: --tail, --scale, and of --set what is no weight of a reward.
+
+    Test      tests/test_play.py::test_note_on_another_body"""
+    changes = [c.strip() for c in (switches.set or "").split(";") if c.strip()]
+    changes = sorted(c for c in changes if c.split(".")[0] not in ("reward", "training", "metrics"))
+    found = {"tail": switches.tail if switches.tail != "active" else None, "set": "; ".join(changes)}
+    found["scale"] = switches.scale if switches.scale not in (None, 1.0) else None
+    return {k: v for k, v in found.items() if v}
 
 
 def devices_of(meta, path, sensors: str | None) -> int:

@@ -353,8 +353,8 @@ class Trainer:
         return stats | {"explained_variance": explained} | sizes
 
     def data(self) -> dict:
-        """What tells whether two runs saw the same: of the motions.  Test: tests/test_ppo.py::test_fingerprint"""
-        return training.motions(self.env.ref)
+        """What tells whether two runs saw the same.  Test: tests/test_ppo.py::test_resume_refuses_other_tables"""
+        return training.motions(self.env.ref) | {"tables": training.tables_of(self.env.char)}
 
     def save(self, path, meta):
         """Everything: policy, optimisers, environment, random states."""

@@ -176,7 +176,7 @@ def recorded(char: Character, folder, devices: int) -> tuple[dict, list[str]]:
     by_source, flags = {}, play.Options(stream=str(folder))
     taken, broken = sound(lambda file: (file, play.ticks_of(char, file, devices, flags)), play.recordings_of(folder))
     for file, stream in taken:
-        by_source.setdefault(f"recordings: {file.stem.partition('_')[0]}", []).append(stream)
+        by_source.setdefault(f"recordings: {file.stem.partition('_')[0]}", []).append(stream[:2])
     return by_source, broken
 
 

@@ -175,7 +175,9 @@ class Stream:
         """What is to be said of the rows' times.  Test: tests/headset/test_stream.py::test_sample_rate"""
         if self.rows and not self.clock.timed:
             return [f"no time column: {self.clock.rate:g} rows a second (--sample-rate)"]
-        return ["the stream has times: --sample-rate is not used"] if self.rows and self.told_rate else []
+        lines = ["the stream has times: --sample-rate is not used"] if self.rows and self.told_rate else []
+        counts = {"rows before their predecessor": self.clock.dropped, "jumps of the clock": self.clock.jumps}
+        return lines + [f"{n} {what}" for what, n in counts.items() if n]
 
     def report(self) -> list[str]:
         """What was calibrated and what went wrong, for a reader.
@@ -188,10 +190,4 @@ class Stream:
                 f"user's headset {c.height:.2f} m above the floor; floor at {c.floor:.2f} m ({how}); "
                 f"forward {np.degrees(c.yaw):.0f} degrees; heights times {c.scale[2]:.3f}"
             )
-        lines += self.times() + self.guard.report()
-        for n, what in (
-            (self.clock.dropped, "rows before their predecessor"),
-            (self.clock.jumps, "jumps of the clock"),
-        ):
-            lines += [f"{n} {what}"] if n else []
-        return lines
+        return lines + self.times() + self.guard.report()

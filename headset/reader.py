@@ -578,6 +578,13 @@ class Guard:
             lines.append(f"{' '.join(key)}: {n} time{'s' * (n > 1)}{lasted}")
         return lines
 
+    def lost(self) -> dict:
+        """Seconds for which each device was lost, for whatever reason.
+
+        Test      tests/headset/test_stream.py::test_folder_of_recordings"""
+        names = DEVICES[: self.devices]
+        return {name: round(sum(s for key, s in self.seconds.items() if key[0] == name), 3) for name in names}
+
     def _one(self, t, rows, why=None):
         """One row of every device -> Sample or None."""
         dt = 0.0 if self.t is None else t - self.t

@@ -146,13 +146,28 @@ def motions(ref) -> dict:
     return {"fingerprint": fingerprint(ref.qpos), "sequences": len(ref.names), "minutes": len(ref) / ref.rate / 60}
 
 
-def check_same(seen, now, out):
-    """UserError unless a run that is resumed sees the motions that it saw before.
+def tables_of(char) -> dict:
+    """What a character's TOML, with --set, says of a run: weights, torques, pose; not how it is trained and measured.
 
-    Test      tests/test_ppo.py::test_resume_refuses_other_options"""
+    Why       the file can be edited between two launches, and a run that goes on would follow another reward
+    Test      tests/test_ppo.py::test_resume_refuses_other_tables"""
+    return {name: table for name, table in char.spec.items() if name not in ("training", "metrics")}
+
+
+def check_same(seen, now, out):
+    """UserError unless a run that is resumed sees the motions, and the character's tables, that it saw before.
+
+    Test      tests/test_ppo.py::test_resume_refuses_other_options, test_resume_refuses_other_tables"""
     if not isinstance(seen, dict) or seen.get("fingerprint") != now["fingerprint"]:
-        changed = f"the motions have changed since the run began ({seen} against {now})"
+        told = [{k: v for k, v in a.items() if k != "tables"} if isinstance(a, dict) else a for a in (seen, now)]
+        changed = f"the motions have changed since the run began ({told[0]} against {told[1]})"
         raise UserError(f"{out}: {changed}; start a new run with --init {out}")
+    before, tables = seen.get("tables"), now.get("tables")
+    if isinstance(before, dict) and tables is not None:  # runs of before 2026-12 kept none
+        if odd := [name for name in sorted({*before, *tables}) if before.get(name) != tables.get(name)]:
+            was = f"{', '.join(f'[{name}]' for name in odd)} of the character's TOML changed since the run began"
+            back = f"put it back, as {CONFIG} has it, or start a new run with --init {out}"
+            raise UserError(f"{out}: {was}; {back}")
 
 
 def progress_line(stats) -> dict:

@@ -398,6 +398,23 @@ def test_character_of_the_policy(char, ref, tmp_path):
         play.main(["--policy", str(path), "--measure", "--clips", "walk_005"])
 
 
+def test_note_on_another_body(capsys):
+    """Another size or posture that happens to have as many joints is played, and said; other weights are not."""
+    meta = {"options": {"character": "oppy", "scale": 1.7, "set": "reward.contact=[0, 1]; pose.spine_y=0.1"}}
+    note = "note: p was trained with --set pose.spine_y=0.1 --scale 1.7, and is played with"
+    for flags, says in (
+        ({}, ""),
+        ({"scale": 1.7}, ""),
+        ({"set": "reward.q=[1, 2]; pose.spine_y=0.1"}, ""),
+        ({"scale": 1.0}, f"{note} --set pose.spine_y=0.1\n"),
+        ({"set": "reward.q=[1, 2]", "scale": 1.0}, f"{note} no changes\n"),
+    ):
+        metrics.load_character(play.Options(**flags), meta, "p")
+        assert capsys.readouterr().err == says
+    metrics.load_character(play.Options(scale=1.5), {}, "p")
+    assert not capsys.readouterr().err  # what it was trained as is not known
+
+
 def test_headset_only(char, ref, tmp_path):
     """§4.2: a policy of the headset alone sees it alone; another one's controllers hang; targets stay the user's."""
     less = headset_only(ref)

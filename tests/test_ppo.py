@@ -1,6 +1,7 @@
 """PPO: Appendix B's formulas against slow loops and torch; the loop's bookkeeping; exact resume."""
 
 import itertools
+import re
 import shutil
 from dataclasses import fields, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from scipy.stats import norm
 
 import character
 import ppo
-from character import TERMS
+from character import CHARACTERS, TERMS
 from env import Env, Uniform
 from mocap import data
 from nn import gaussian_logp
@@ -547,6 +548,26 @@ def test_resume_refuses_other_options(whole, tmp_path, monkeypatch):
     with pytest.raises(UserError, match="motions have changed.*--init"):
         train(whole, 8, "--resume")
     assert before == {p: p.read_bytes() for p in whole.iterdir()}  # refused: untouched
+
+
+def test_resume_refuses_other_tables(tmp_path):
+    """A weight that was changed in the TOML is the ablation of a new run, not of the one that goes on."""
+    own = tmp_path / "mine.toml"
+    shutil.copy(CHARACTERS / "dino.xml", tmp_path)
+    shutil.copy(CHARACTERS / "dino.toml", own)
+    train(tmp_path / "a", 1, "--character", str(own))
+    kept = read_config(tmp_path / "a")["config"]["data"]["tables"]
+    assert kept["reward"]["orientation"] == character.load("dino").spec["reward"]["orientation"]
+    as_it_was = own.read_text()
+    changed = re.sub(r"(?m)^orientation *= *\[[^,]*", "orientation = [0", as_it_was)
+    assert changed != as_it_was
+    own.write_text(changed)
+    before = {p: p.read_bytes() for p in (tmp_path / "a").iterdir()}
+    with pytest.raises(UserError, match=r"\[reward\] of the character's TOML changed.*--init"):
+        train(tmp_path / "a", 2, "--resume")
+    assert before == {p: p.read_bytes() for p in (tmp_path / "a").iterdir()}  # refused: untouched
+    own.write_text(re.sub(r"(?m)^lr *= .*", "lr = 1e-6", as_it_was))  # the recipe is read once, when a run begins
+    train(tmp_path / "a", 2, "--resume")
 
 
 def test_resume_accepts_what_changes_nothing(whole, tmp_path):

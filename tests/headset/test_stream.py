@@ -364,10 +364,10 @@ def test_sample_rate(jesse, walk, tmp_path, capsys):
         (timeless, 30.0, f"{path}: no time column: 30 rows a second (--sample-rate)\n"),
     ):
         path.write_text("".join(text))
-        pos, _ = play.ticks_of(jesse, path, 3, play.Options(axes="mujoco", grip=90.0, sample_rate=rate))
+        pos, *_ = play.ticks_of(jesse, path, 3, play.Options(axes="mujoco", grip=90.0, sample_rate=rate))
         assert capsys.readouterr().out == said
         assert abs(len(pos) - (len(walk) / (3 if text is timeless and not rate else 1) - 30)) <= 2
-    short, _ = play.ticks_of(jesse, path, 3, play.Options(axes="mujoco", grip=90.0, seconds=0.01))
+    short, *_ = play.ticks_of(jesse, path, 3, play.Options(axes="mujoco", grip=90.0, seconds=0.01))
     assert len(short) == 1
 
 
@@ -836,11 +836,12 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
     told = capsys.readouterr().out.splitlines()
     assert told[0].startswith("a.csv: ") and told[2].startswith("all 2, completed ")
     for name, row in found["files"].items():
-        assert set(row) == set(play.OF_FILE) and row["completed"] == (row["failures"] == 0)
+        assert set(row) == {*play.OF_FILE, "lost_s"} and row["completed"] == (row["failures"] == 0)
+        assert row["lost_s"] == {"head": 0, "left": 0, "right": 0}
         code, alone = played(tmp_path / name)
         [same] = alone["files"].values()
         assert code == 0 and {k for k in same if same[k] is None} == {k for k in row if row[k] is None}
-        for key in same:
+        for key in play.OF_FILE:
             assert same[key] is None or same[key] == pytest.approx(row[key], rel=1e-4), key
     total = found["all"]
     assert total["seconds"] == pytest.approx(sum(r["seconds"] for r in found["files"].values()), abs=0.01)
@@ -855,6 +856,11 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
     told = capsys.readouterr().out
     assert code == 1 and len(found["files"]) == 2 and "broken.csv, line 1: no column" in told
     assert "gone.csv: no such file" in told and "\nb\\x1b[31m\\udcff.csv: " in told
+    rows[60:90, 1:8] = np.nan  # the headset, from 2 to 3 s
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header=",".join(names), comments="", fmt="%.9g")
+    [row] = played(tmp_path / "a.csv")[1]["files"].values()
+    assert row["lost_s"] == {"head": pytest.approx(30 / walk.rate, abs=0.04), "left": 0, "right": 0}
+    assert f"; lost: head {row['lost_s']['head']:.1f} s\n" in capsys.readouterr().out
     _, short = played(tmp_path / "a.csv", "--seconds", "1")
     assert short["all"]["seconds"] == 1.0
     (tmp_path / "none").mkdir()
