@@ -43,6 +43,7 @@ try:
 except ImportError:
     gymnasium, One, VectorEnv = None, object, object
 
+INSTALL = "python -m pip install -e '.[gym]'"
 NO_SB3 = "stable-baselines3 is not installed: python -m pip install -e '.[peers]'"
 REWARD_CLIP = 10.0  # of normalised rewards [Huang22]
 RECENT = 100  # episodes in the mean return that is printed
@@ -51,7 +52,7 @@ RECENT = 100  # episodes in the mean return that is printed
 def need_gymnasium():
     """UserError where the extra is missing.  Test: tests/extras/test_gym_env.py::test_without_gymnasium"""
     if gymnasium is None:
-        raise UserError("gymnasium is not installed: python -m pip install -e '.[gym]'")
+        raise UserError(f"gymnasium is not installed: {INSTALL}")
 
 
 # ------------------------------------------------------------------------------------ our characters for others
@@ -264,10 +265,10 @@ def make(task):
     need_gymnasium()
     try:
         made = gymnasium.make(task, disable_env_checker=True)
-    except gymnasium.error.DependencyNotInstalled as e:
-        raise UserError(f"{task}: {e}; python -m pip install -e '.[gym]'") from None
     except (gymnasium.error.Error, ImportError) as e:
-        raise UserError(f"{task}: {e}; valid: a task that gymnasium.make knows, as HalfCheetah-v4") from None
+        lacks = isinstance(e, (gymnasium.error.DependencyNotInstalled, ModuleNotFoundError)) and ":" not in str(task)
+        valid = "valid: a task that gymnasium.make knows, as HalfCheetah-v4"
+        raise UserError(f"{task}: {e}; {INSTALL if lacks else valid}") from None
     if not isinstance(made.action_space, spaces.Box) or len(made.action_space.shape) != 1:
         raise UserError(f"{task}: its actions are {made.action_space}; valid: a Box of one dimension")
     if not made.observation_space.is_np_flattenable:

@@ -225,5 +225,12 @@ def test_wrong_tasks(tmp_path, capsys, monkeypatch):
     assert "Discrete(2); valid: a Box" in refuse("--task", "CartPole-v1")
     assert "--motion" in refuse("Pendulum-v1", "--motion", "x")
     assert "leaky_relu, tanh" in refuse("--activation", "sine").replace("'", "")
+    assert "valid: a task that gymnasium.make knows" in refuse("nobodys_tasks:Walk-v0")
+
+    def without_imageio(*args, **flags):
+        raise ModuleNotFoundError("No module named 'imageio'", name="imageio")
+
+    monkeypatch.setattr(gym_env.gymnasium, "make", without_imageio)
+    assert "'imageio'; python -m pip install -e '.[gym]'" in refuse("HalfCheetah-v4")
     monkeypatch.setattr(gym_env, "gymnasium", None)
     assert "pip install -e '.[gym]'" in refuse("Pendulum-v1")
