@@ -47,6 +47,7 @@ MOST = 2.0  # ASSUMED: a beginning that fails more often than so many times the 
 SHORTEST = 1.0  # s of a clip that is made a visit
 RUNS = 2.0  # m/s, ASSUMED: a stitched sequence with a faster second is made visits, too
 FEW, MORE = 100, 2  # ASSUMED: visits of parts of --motion that have fewer clips are made by so many more other users
+EARLY = 8  # first frames of a recording, ASSUMED: a start among them has its transient
 PLAYERS_STAND = 1.5  # ASSUMED: s at a recording's beginning in which a player stands well enough to start under
 AIDED = 10.0  # s between failures, ASSUMED: sequences that do as well are not aided
 REACHED = 0.5  # s, ASSUMED: in which the hand that aids would have the root at its target
@@ -65,6 +66,9 @@ class Options(ppo.Options):
     retry: float = arg(0.0, "share of episodes that start up to 2 s before a place where one failed", check=UNIT)
     stand: float = arg(0.0, "share that start in the default pose under the headset, as a stream does", check=UNIT)
     begin: float = arg(0.0, "share that start so under a user who stands still before a visit", check=UNIT)
+    early: float = arg(
+        0.0, "share that start in the first frames of recordings in motion, as `tracked` does", check=UNIT
+    )
     kinds: float = arg(0.0, "share of the starts that goes to kinds of motion by how often each fails", check=UNIT)
     players: str | None = arg(
         None, "also the people of a headset's recordings (a folder of .csv files), with bodies (headset/body.py)"
@@ -76,6 +80,9 @@ class Options(ppo.Options):
     push: float = arg(0.0, "largest random push, every 2 s on average [m/s]", check=NONNEGATIVE)
     aid: float = arg(0.0, "a hand on the root where a sequence fails often: at most so much of it a step", check=UNIT)
     root_limit: float = arg(ROOT_LIMIT, "an episode ends as far from the root's target [§3.6: 0.30 m]", check=POSITIVE)
+    near: float | None = arg(
+        None, "so far where nobody stood at the beginning; --root-limit by default [m]", check=POSITIVE
+    )
     root_lag: float = arg(0.0, "and as far again as the user went in so many seconds, of late", check=NONNEGATIVE)
     episode: int = arg(EPISODE_STEPS, "control steps to truncation [§3.6]", check=POSITIVE)
     solver: str = arg("pgs", "of contacts: pgs, or newton, exact, as when playing", tuple(character.SOLVERS))
@@ -91,7 +98,8 @@ class Curriculum(Uniform):
     Equation  uniform over all frames [§3.6]; with `balance` half of the simulated time is shared out by frames and half
               by frames × rate of failure:  p(sequence) ∝ frames (1 + h / ⟨h⟩) / E[T],  E[T] = (1 − e^{−hH}) / h, within
               the sequence uniform.  A share `retry` starts RETRY steps before a place where an episode failed of late.
-              A share `begin` starts in the still frames before a visit, in sequences drawn by 1 + min(h / ⟨h⟩, MOST)
+              A share `early` starts in the first EARLY frames of sequences that begin in motion, drawn by
+              1 + min(h / ⟨h⟩, MOST).  A share `begin` starts in the still frames before a visit, in sequences drawn so
               with `balance`, evenly without.  Those stand in the default pose, and a share `stand` of all.
               A share `kinds` of the time and of the beginnings is shared out among kinds of motion by how often each
               fails, times the square root of its frames, and within a kind by frames × h, of beginnings by
@@ -101,15 +109,16 @@ class Curriculum(Uniform):
     Why       after a while most failures are in a few sequences, and a uniform draw spends its steps on the others;
               within them they are at a few places, such as the first steps of a run.  And a policy that has always been
               put into mid-motion has never set off.  What has few recordings is not what users do seldom: sixty
-              gestures and steps backwards beside nine hundred walks and runs were one start in thirty, and not learnt
+              gestures and steps backwards beside nine hundred walks and runs were one start in thirty, and not learnt.
+              Recordings of runs begin while their user speeds up; one start in 500 is there, and there `tracked` fails
     Note      with `balance` a failure of a start in the default pose counts as one of the sequence that it was in
     Test      tests/extras/test_train.py::test_balanced_starts, test_retried_starts, test_begun_starts,
-              test_kinds_of_starts
+              test_kinds_of_starts, test_early_starts
     """
 
     def __init__(
         self, ref: Reference, horizon=EPISODE_STEPS, balance=False, retry=0.0, stand=0.0, begin=0.0, kinds=0.0,
-        kind=None,
+        kind=None, early=0.0,
     ):  # fmt: skip
         """kind : (S,) of each sequence, 0, 1, …  (`kind_of`); all of one by default"""
         super().__init__(ref)
@@ -118,13 +127,18 @@ class Curriculum(Uniform):
         self.failed = np.full(len(ref.first), 0.5)  # of each sequence, failures and steps lived, of late
         self.lived = np.full(len(ref.first), float(horizon))
         self.lost = np.zeros(PLACES, int)  # frames at which episodes failed of late; 0: none yet
-        self.leads = np.flatnonzero(ref.still > 1)  # sequences that begin with a user who stands
+        self.early, self.leads = early, np.flatnonzero(ref.still > 1)  # sequences that begin with a user who stands
+        self.moving = np.flatnonzero((ref.still <= 1) & (ref.last - ref.first > EARLY))
         if begin and not len(self.leads):
             raise UserError(f"--begin {begin}: no sequence begins with a user who stands; valid: 0, or with visits")
+        if early and not len(self.moving):
+            raise UserError(f"--early {early}: every sequence begins with a user who stands; valid: 0")
 
     def draw(self, rng, n):
         """As `Uniform.draw`: frames (n,), and which start in the default pose (n,) bool."""
         f = self.balanced(rng, n) if self.balance or self.kinds else rng.choice(self.frames, n)
+        if self.early:
+            f = np.where(rng.random(n) < self.early, self.first_frames(rng, n), f)
         if self.retry:
             place = self.lost[rng.integers(PLACES, size=n)]
             before = place - rng.integers(*RETRY, size=n)
@@ -158,6 +172,14 @@ class Curriculum(Uniform):
         cdf = np.cumsum(by_kind(p, hard, np.ones(len(k)), self.kind[k], self.kinds))
         k = k[np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right").clip(0, len(k) - 1)]
         return ref.first[k] + 1 + (rng.random(n) * (ref.still[k] - 1)).astype(int)
+
+    def first_frames(self, rng, n):
+        """Frames (n,) among the first EARLY of sequences that begin in motion."""
+        k = self.moving
+        h = np.maximum(self.failed[k] / self.lived[k], 1e-6)
+        cdf = np.cumsum(1.0 + np.minimum(h / h.mean(), MOST))
+        k = k[np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right").clip(0, len(k) - 1)]
+        return self.ref.first[k] + 1 + rng.integers(0, EARLY, n)
 
     def count(self, rng, frames, failed, steps):
         """Running counts of failures and of steps lived per sequence, decayed by 0.9 at each episode's end; and the
@@ -452,20 +474,23 @@ def read_reference(path, char) -> Reference:
 # ------------------------------------------------------------------------------------ training
 
 
-def patience(ref: Reference, limit, lag):
+def patience(ref: Reference, limit, lag, near=None):
     r"""How far from its target the root may be at each frame: farther under a fast user than under one who stands.
 
-    Equation  limit + lag × the user's highest speed in the last LATE seconds
-    Why       with one limit for all, a character that may be late for a run may also wander off from a user who waves
+    Equation  limit + lag × the user's highest speed in the last LATE seconds; limit is `near` in sequences that do not
+              begin with a user who stands
+    Why       with one limit for all, a character that may be late for a run may also wander off from a user who waves,
+              and one that may catch up with a user who set off need not keep up with one who runs
     Returns   (F,) [m]
     Test      tests/extras/test_train.py::test_patience"""
     speed = np.linalg.norm(ref.qvel[:, :2], axis=1)
     out = np.empty(len(ref))
     n = round(LATE * ref.rate)
-    for a, b in zip(ref.first, ref.last, strict=True):
+    for a, b, still in zip(ref.first, ref.last, ref.still, strict=True):
         part = np.concatenate([np.zeros(n - 1), speed[a : b + 1]])
-        out[a : b + 1] = np.lib.stride_tricks.sliding_window_view(part, n).max(axis=1)
-    return limit + lag * out
+        out[a : b + 1] = lag * np.lib.stride_tricks.sliding_window_view(part, n).max(axis=1)
+        out[a : b + 1] += limit if near is None or still > 1 else near
+    return out
 
 
 def make_env(opt: Options) -> Env:
@@ -478,7 +503,7 @@ def make_env(opt: Options) -> Env:
     ref = reference_of(opt, char)
     ref = headset_only(ref) if opt.sensors == "hmd" else ref
     added = {name: getattr(opt, name) for name in ("sensor_offset", "sensor_noise", "push", "aid")}
-    starts = {name: getattr(opt, name) for name in ("balance", "retry", "stand", "begin", "kinds")}
+    starts = {name: getattr(opt, name) for name in ("balance", "retry", "stand", "begin", "kinds", "early")}
     counted = any(starts.values()) or opt.aid  # failures by sequence
     return Env(
         char,
@@ -490,7 +515,7 @@ def make_env(opt: Options) -> Env:
         disturbance=Disturbance(opt.envs, ref.sensor_pos.shape[1], **added) if any(added.values()) else None,
         asymmetric="asymmetric" not in opt.without,
         starts=Curriculum(ref, opt.episode, **starts, kind=kind_of(ref.names, opt)) if counted else None,
-        root_limit=patience(ref, opt.root_limit, opt.root_lag) if opt.root_lag else opt.root_limit,
+        root_limit=patience(ref, opt.root_limit, opt.root_lag, opt.near),
     )
 
 

@@ -151,6 +151,26 @@ def test_begun_starts(visited):
         Curriculum(walks, begin=0.4)
 
 
+def test_early_starts(visited):
+    """A share starts in the first frames of what begins in motion, and there more often where it fails, up to MOST."""
+    ref, n, rng = visited, 20_000, np.random.default_rng(0)
+    starts = Curriculum(ref, early=0.4)
+    starts.failed[:], starts.lived[:] = [1, 9, 5, 5], 100.0
+    frames, upright = starts.draw(rng, n)
+    owner = Uniform(ref).owner
+    into = frames - ref.first[owner[frames]]
+    assert not upright.any() and into.min() >= 1  # the frame before is the user's, too
+    for k, weight in ((0, 1 + 1 / 5), (1, 1 + 9 / 5)):
+        early = (owner[frames] == k) & (into <= train.EARLY)
+        uniform = 0.6 * train.EARLY / len(starts.frames)
+        assert early.mean() == pytest.approx(0.4 * weight / 4 + uniform, abs=0.015)
+        assert set(into[early]) == set(range(1, train.EARLY + 1))
+    late = (owner[frames] >= 2) | (into > train.EARLY)
+    assert late.mean() == pytest.approx(0.6, abs=0.03)
+    with pytest.raises(UserError, match="--early 0.4: every sequence begins with a user who stands"):
+        Curriculum(replace(ref, still=np.full(4, 20)), early=0.4)
+
+
 def test_kinds_of_starts(visited, tmp_path):
     """A share of the draws goes to kinds of motion by how often they fail; within a kind most are where it fails."""
     p, failing, size = np.array([1.0, 3.0, 4.0, 0.0]), np.array([2.0, 2.0, 1.0, 0.0]), np.array([10.0, 30.0, 20.0, 5.0])
@@ -306,6 +326,11 @@ def test_patience(ref):
     for a, b in zip(ref.first, ref.last):
         for f in range(a, b + 1, 7):
             assert found[f] == pytest.approx(0.4 + 0.2 * speed[max(a, f - 44) : f + 1].max())
+    np.testing.assert_array_equal(train.patience(ref, 0.4, 0.0), 0.4)
+    assert len(ref.first) > 1  # a user who stood at the beginning has the wider limit
+    visit = replace(ref, still=20 * (np.arange(len(ref.first)) == 1))
+    limit, inside = train.patience(visit, 0.9, 0.1, near=0.33), Uniform(ref).owner == 1
+    np.testing.assert_allclose(limit, train.patience(ref, 0.0, 0.1) + np.where(inside, 0.9, 0.33))
     env = Env(character.load("jesse"), ref, 4, threads=1, root_limit=found, autoreset=False)
     env.reset(frames=[int(ref.first[0])] * 4)
     limit = found[ref.first[0] + 1]
