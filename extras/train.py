@@ -310,6 +310,8 @@ def clips_of(opt: Options) -> list:
     Test      tests/extras/test_train.py::test_clips"""
     reading, single, clips, runs, few = Reading.of(opt), [], [], [], []
     data.check_unseen(data.parts(opt.motion), "train")
+    if opt.players:
+        body.check_players(opt.players)
     for each in data.parts(opt.motion):  # as `data.sequences`, but the single clips are wanted, too, and read once
         say(f"reading {each}")
         found = data.load(each, clips=opt.clips, split="train", reading=reading)

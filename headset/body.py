@@ -8,6 +8,8 @@ signal, as the kinematic retargeting is: the feet of the real player may have st
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
@@ -170,6 +172,15 @@ def two_bone_arm(shoulder, wrist, elbow, a, b):
     return upper * half_turn, fore * half_turn
 
 
+def check_players(folder):
+    """UserError unless there are recordings in a folder, or it is one: said before other motions are read.
+
+    Test      tests/headset/test_body.py::test_recordings"""
+    if not os.path.exists(folder) or not files_of(folder):
+        why = "no recordings" if os.path.exists(folder) else "no such file or folder"
+        raise UserError(f"--players {folder}: {why}; valid: .csv or .bsor files that `play.py --stream` reads")
+
+
 def players(folder) -> list[Clip]:
     """A body for every recording of a folder that shows a standing player; others are left out, and named.
 
@@ -187,10 +198,8 @@ def players(folder) -> list[Clip]:
             raise UserError(f"{file}: the headset is {height:.2f} m up; valid: 1.0 to 2.1 m, the floor at 0")
         return embodied(pos, quat, file.stem)
 
+    check_players(folder)
     files = files_of(folder)
-    if not files:
-        valid = "a folder of .csv or .bsor files that `play.py --stream` reads"
-        raise UserError(f"{folder}: no recordings; valid: {valid}")
     out, broken = sound(embody, files)
     for error in broken:
         print(f"left out: {error}")

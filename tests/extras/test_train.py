@@ -343,6 +343,9 @@ def test_players(monkeypatch, tmp_path):
     """Recordings with bodies: each as two visits, and as it is, to be started under while the player stands."""
     person = data.builtin_clips()[2][:90]
     monkeypatch.setattr(body, "players", lambda folder: [person])
+    with pytest.raises(UserError, match="--players .*: no recordings"):  # before anything is read
+        train.clips_of(small(players=str(tmp_path), motion="no/such/folder"))
+    (tmp_path / "a.csv").touch()
     clips = train.clips_of(small(players=str(tmp_path)))
     assert [c.still for c in clips[-1:]] == [45] and clips[-1].name == person.name
     assert sum(c.name.endswith("-visit") for c in clips) == 2

@@ -90,8 +90,10 @@ def test_two_bone_arm():
 
 def test_recordings(worn, tmp_path, capsys):
     """A folder of recordings: one that is none is named and left out; none at all is an error."""
-    with pytest.raises(UserError, match="no recordings; valid: a folder of .csv or .bsor files"):
+    with pytest.raises(UserError, match="--players .*: no recordings; valid: .csv or .bsor files"):
         body.players(tmp_path)
+    with pytest.raises(UserError, match="--players .*nothing: no such file or folder; valid: .csv"):
+        body.players(tmp_path / "nothing")
     (tmp_path / "broken.csv").write_text("time,head_px\n0,1\n")
     with pytest.raises(UserError, match="broken.csv, line 1: no column"):
         body.players(tmp_path)
