@@ -7,6 +7,7 @@ r"""Policies made of policies: shipped, averaged, joined, carried over to anothe
                                                                        is faster than it: is less late
     python -m extras.policies join OUT.npz A B --motors 'elbow_*'      one network of two: A's elbows, all else B's
     python -m extras.policies join OUT.npz A B --backwards 0.15        or B where headset and root go backwards
+    python -m extras.policies join OUT.npz A B --faster 1.5            or B where they go forwards, faster
     python -m extras.policies carry OLD.npz NEW.npz --character dino   to go on with as another character, another
                                                                        variation, with other sensors or wider layers
 
@@ -40,6 +41,7 @@ from plumbing.runs import fmt_count, git_state, save_checkpoint, versions
 from policy import Policy, devices_of, load_policy, sensors_of, total_steps, trained_as
 
 GATE = dict(width=0.1, depth=10.0, scale=3.0)  # of `gated`: m/s; how far units are put off; a unit's size.  ASSUMED
+RUN_WIDTH = 0.4  # m/s, of the gate to an expert of runs: a runner's speed swings in every step.  ASSUMED
 ROOT_SHARE = 0.8  # of the speed that opens it: the character's own, the rest the headset's.  ASSUMED (RESULTS.md)
 LEADS = (lambda v: abs(v) <= 0.5, "from -0.5 to 0.5 s")
 SPEEDS = (lambda v: 0.0 < v <= 5.0, "above 0, at most 5 m/s")
@@ -360,12 +362,13 @@ def join(out_path, one_path, other_path, opt: Join) -> dict:
     Args      opt.motors : patterns of hinges, as in 'shoulder_*': those act by the first policy, the rest by the
               second, which may know the headset alone; or opt.backwards [m/s]: the second acts while headset and root
               go backwards, in the character's heading, faster than that (ROOT_SHARE: a user's steps are not even, and
-              a network has no memory but its body)
-    Raises    UserError: both or neither; another body, a pattern that no motor or every motor fits, inputs that the
-              first does not have, a policy that is shown its user ahead
+              a network has no memory but its body); or opt.faster: while they go forwards faster
+    Raises    UserError: none or several of these; another body, a pattern that no motor or every motor fits, inputs
+              that the first does not have, a policy that is shown its user ahead
     Test      tests/extras/test_policies.py::test_join_command"""
-    if bool(opt.motors) == (opt.backwards is not None):
-        raise UserError("join: valid: one of --motors and --backwards")
+    asked = {k: v for k in ("motors", "backwards", "faster") if (v := getattr(opt, k)) not in (None, ())}
+    if len(asked) != 1:
+        raise UserError("join: valid: one of --motors, --backwards and --faster")
     (one, meta), (other, its) = load_policy(one_path), load_policy(other_path)
     bodies = _body(meta, one_path), _body(its, other_path)
     if not all(bodies) or bodies[0] != bodies[1]:
@@ -380,20 +383,21 @@ def join(out_path, one_path, other_path, opt: Join) -> dict:
     if lacking := [n for n in need if n not in have]:
         raise UserError(f"{other_path}: sees {lacking[0]}, which {one_path} does not; valid: in the other order")
     inputs, step = [have.index(n) for n in need], (1.0 - ROOT_SHARE) * CONTROL_RATE
-    moves = {"user_previous.h.x": step, "user.h.x": -step, "qd.vx": -ROOT_SHARE}  # m/s backwards
+    moves = {"user_previous.h.x": -step, "user.h.x": step, "qd.vx": ROOT_SHARE}  # m/s forwards
+    sign, gate = (-1.0, GATE) if opt.backwards else (1.0, GATE | {"width": RUN_WIDTH})
+    moves, speed = {have.index(n): sign * m for n, m in moves.items()}, opt.backwards or opt.faster
     try:
         if own is not None:
             policy = joined(one, other, inputs, own)
         else:
-            policy = gated(one, other, inputs, {have.index(n): m for n, m in moves.items()}, opt.backwards, **GATE)
+            policy = gated(one, other, inputs, moves, speed, **gate)
     except ValueError as e:
         raise UserError(f"join {one_path} {other_path}: {e}; valid: networks of as many layers") from None
     kept = {k: meta[k] for k in ("data", "gain", "reward") if k in meta}
     kept |= {"policy": policy.shape(), "steps": total_steps(meta)}
     kept["options"] = meta["options"] | {"hidden": list(policy.hidden), "init": None, "out": None}
     kept["licence"] = each_once(licences_of(meta, one_path) + licences_of(its, other_path)) or "MIT"
-    how = {"motors": list(opt.motors)} if opt.motors else {"backwards": opt.backwards}
-    kept["joined"] = {"with": Path(other_path).name} | how
+    kept["joined"] = {"with": Path(other_path).name} | {k: list(v) if k == "motors" else v for k, v in asked.items()}
     kept |= {"versions": versions(), "git": git_state()}
     save_checkpoint(out_path, policy.arrays(), kept)
     return kept
@@ -628,6 +632,7 @@ class Join:
 
     motors: tuple[str, ...] = arg((), "names of hinges, with * and ?: those of A's network act, of all others B's")
     backwards: float | None = arg(None, "instead: B's network acts while both go backwards faster, m/s", check=SPEEDS)
+    faster: float | None = arg(None, "instead: B's network acts while both go forwards faster, m/s", check=SPEEDS)
 
 
 @dataclass
@@ -701,7 +706,8 @@ def main(argv=None):
         print(f"{out}: {meta['options']['character']}, {fmt_count(meta['steps'])} steps before")
     elif what == "join":
         meta = join(*files, opt)
-        ours, rest = (", ".join(opt.motors), "the rest") if opt.motors else ("forwards", "backwards")
+        ours, rest = ("forwards", "backwards") if opt.backwards else ("slower", "faster")
+        ours, rest = (", ".join(opt.motors), "the rest") if opt.motors else (ours, rest)
         print(f"{out}: {ours} of {read[0]}, {rest} of {read[1]}; {meta['licence']}")
     else:
         run, *others = read
