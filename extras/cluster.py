@@ -152,7 +152,7 @@ class Workers:
             raise UserError(f"--envs {opt.envs} of {opt.workers} workers: not the same number each; valid: a multiple")
         self.env, self.n, self.workers = env, opt.envs, opt.workers
         self.opt = replace(opt, envs=opt.envs // opt.workers)
-        for name in ("name", "ref", "dt", "obs_size", "critic_size", "action_size", "value_scale"):
+        for name in ("name", "char", "ref", "dt", "obs_size", "critic_size", "action_size", "value_scale"):
             setattr(self, name, getattr(env, name))
         self.rngs = [np.random.default_rng([opt.seed, 1, k]) for k in range(1, opt.workers)]
         self.states, self.begun = [None] * opt.workers, [0] * opt.workers

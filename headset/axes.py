@@ -41,9 +41,9 @@ LIES = 0.01  # m of standard deviation: a controller that moves less is in nobod
 HANGS = 0.1  # m, horizontally from the face to a hanging hand, either way
 WALKS = 0.4  # m/s of a headset: it is carried somewhere
 SWAPPED = 0.8  # what the fit of another order of devices must gain over the one told.  ASSUMED
-PERSON = 4.0  # of at most 8: what reads like a person.  Recorded: 4.5 to 6.3, 3.1 with controllers on a table, at
-# most 3.1 with rotations in the order w, x, y, z
-NOBODY = "fits no person well: are the columns in place, rotations x, y, z, w?  A controller that lies fits badly, too"
+PERSON = 4.0  # of at most 8: what reads like a person.  Recorded: 4.5 to 6.3, 3.1 with controllers on a table, and at
+# most 3.1 read as what it is not, rotations in the order w, x, y, z
+NOBODY = "fits no person well: are the columns in place, rotations x, y, z, w?  (A controller that lies fits badly)"
 SURE = 0.6  # by how much a fit must be better to be said.  ASSUMED
 OTHER_GRIP = 0.3  # what it costs that a controller is not held as these axes' own are.  ASSUMED
 GRIP_OFF = 45.0  # degrees from a forearm to where the grip says that the fingers are
@@ -320,8 +320,8 @@ def guess(samples, axes="unity", devices=3, grip=None, unit=None, order=None) ->
     flags = f"--axes {best.axes} --grip {grip:g}" + ("" if best.order == USUAL else f" {devices_flag(best)}")
     flags += f" --stream-unit {unit:g}" if unit else ""
     sure = "" if lead > SURE else f"; not sure: {rest[0].axes} fits nearly as well"
-    odd = [f"{best.score:.1f} of 8: {NOBODY}"] if best.score < PERSON else []
-    return Choice(best.axes, grip, unit, best.order, [f"{FOUND} {flags}{sure}", *odd])
+    odd = f"; {best.score:.1f} of 8: {NOBODY}" if best.score < PERSON else ""
+    return Choice(best.axes, grip, unit, best.order, [f"{FOUND} {flags}{sure}{odd}"])
 
 
 # ------------------------------------------------------------------------------------ a file, a live stream
