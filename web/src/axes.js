@@ -12,6 +12,8 @@ const UNITS = [1, 0.01, 0.001]; // metres a unit
 const REACH = [0.25, 1.4]; // m from headset to controller, in the median
 const [LAG, FARTHEST, LIES, HANGS, WALKS] = [0.1, 1e6, 0.01, 0.1, 0.4];
 const [SWAPPED, PERSON, SURE, OTHER_GRIP, GRIP_OFF] = [0.8, 4, 0.6, 0.3, 45];
+const NOBODY =
+  'fits no person well: are the columns in place, rotations x, y, z, w?  (A controller that lies fits badly)';
 const ORDERS = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
 const DEGREES = 180 / Math.PI;
 
@@ -165,7 +167,8 @@ export function guess(samples, axes = 'unity', devices = 3) { // axes.guess
   const unit = [null, UNIT[best.axes] ?? 1].includes(best.unit) ? null : best.unit;
   const flags = `--axes ${best.axes} --grip ${grip}${order}${unit ? ` --stream-unit ${unit}` : ''}`;
   const sure = lead > SURE ? '' : `; not sure: ${rest[0].axes} fits nearly as well`;
-  const lines = [`axes found from head, hands and forearms: ${flags}${sure}`];
+  const odd = best.score < PERSON ? `; ${best.score.toFixed(1)} of 8: ${NOBODY}` : '';
+  const lines = [`axes found from head, hands and forearms: ${flags}${sure}${odd}`];
   return { axes: best.axes, grip, unit, order: best.order, lines };
 }
 
