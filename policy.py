@@ -293,15 +293,21 @@ def load_character(opt, meta, path) -> Character:
     return asked.load()
 
 
+def parted(changes) -> tuple[list[str], list[str]]:
+    """The changes of --set: those of the body, and those of the reward, which it plays without.
+
+    Test      tests/extras/test_policies.py::test_ship_names_the_reward"""
+    each = [c.strip() for c in (changes or "").split(";") if c.strip()]
+    return [c for c in each if not c.startswith("reward")], [c for c in each if c.startswith("reward")]
+
+
 def body_of(switches: Switches) -> dict:
     """What flags change in a body: --tail, --scale, and of --set what is no weight of a reward.
 
     Test      tests/test_play.py::test_note_on_another_body"""
-    changes = [c.strip() for c in (switches.set or "").split(";") if c.strip()]
-    changes = sorted(c for c in changes if c.split(".")[0] not in ("reward", "training", "metrics"))
-    found = {"tail": switches.tail if switches.tail != "active" else None, "set": "; ".join(changes)}
-    found["scale"] = switches.scale if switches.scale not in (None, 1.0) else None
-    return {k: v for k, v in found.items() if v}
+    changes = "; ".join(sorted(c for c in parted(switches.set)[0] if c.split(".")[0] not in ("training", "metrics")))
+    found = {"tail": (switches.tail, "active"), "set": (changes, ""), "scale": (switches.scale, 1.0)}
+    return {name: value for name, (value, usual) in found.items() if value not in (None, usual)}
 
 
 def devices_of(meta, path, sensors: str | None) -> int:

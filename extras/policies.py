@@ -38,7 +38,7 @@ from nn import LEAKY_SLOPE, MLP, RunningNorm
 from plumbing.cli import ALL_POSITIVE, POSITIVE, UNIT, UserError, arg, cli, given_flags, run_main, some_of, words_first
 from plumbing.files import check_folders
 from plumbing.runs import fmt_count, git_state, save_checkpoint, versions
-from policy import Policy, devices_of, load_policy, sensors_of, total_steps, trained_as
+from policy import Policy, devices_of, load_policy, parted, sensors_of, total_steps, trained_as
 
 GATE = dict(width=0.1, depth=10.0, scale=3.0)  # of `gated`: m/s; how far units are put off; a unit's size.  ASSUMED
 RUN_WIDTH = 0.4  # m/s, of the gate to an expert of runs: a runner's speed swings in every step.  ASSUMED
@@ -117,14 +117,6 @@ def shown_ahead(meta) -> dict:
 def flags_of(options) -> str:
     """{"lead": 0.08} -> "--lead 0.08".  Test: tests/extras/test_policies.py::test_join_command"""
     return " ".join(f"--{k} {v:g}" for k, v in options.items())
-
-
-def parted(changes) -> tuple[list[str], list[str]]:
-    """The changes of --set: those of the body, and those of the reward, which it plays without.
-
-    Test      tests/extras/test_policies.py::test_ship_names_the_reward"""
-    each = [c.strip() for c in (changes or "").split(";") if c.strip()]
-    return [c for c in each if not c.startswith("reward")], [c for c in each if c.startswith("reward")]
 
 
 def _body(meta, path) -> tuple:

@@ -193,8 +193,11 @@ def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, d
     def row_of(drive, clips):
         if opt.rounds == 1:
             return metrics.streamed(char, drive, clips, devices, opt.threads)
-        return counted(drive, put_off([stream_of(char, clip, devices)[:2] for clip in clips], opt.rounds))
+        return counted(drive, clips)
 
+    if opt.rounds > 1:
+        made = {name: [stream_of(char, clip, devices)[:2] for clip in clips] for name, clips in captures.items()}
+        captures = {name: put_off(several, opt.rounds) for name, several in made.items()}
     for title, drive in (("all", act), ("all, no torque", still)):
         rows = []
         for name, clips in captures.items():

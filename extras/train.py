@@ -159,26 +159,26 @@ class Curriculum(Uniform):
         h = np.maximum(self.failed / self.lived, 1e-6)
         steps = -np.expm1(-h * self.horizon) / h  # E[T]
         time = frames * (1.0 + h / np.average(h, weights=frames) if self.balance else steps)
-        cdf = np.cumsum(by_kind(time, frames * h, frames, self.kind, self.kinds) / steps)
-        k = np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right")
+        weights = by_kind(time, frames * h, frames, self.kind, self.kinds) / steps
+        k = drawn(rng, weights, n)
         return ref.first[k] + 1 + (frames[k] * rng.random(n)).astype(int)
 
     def beginnings(self, rng, n):
         """Frames (n,) among the still ones at the beginning of the sequences that have some."""
         ref, k = self.ref, self.leads
-        h = np.maximum(self.failed[k] / self.lived[k], 1e-6)
-        hard = np.minimum(h / h.mean(), MOST)
+        hard = self.hardness(k)
         p = 1.0 + hard if self.balance else np.ones(len(k))
-        cdf = np.cumsum(by_kind(p, hard, np.ones(len(k)), self.kind[k], self.kinds))
-        k = k[np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right").clip(0, len(k) - 1)]
+        k = k[drawn(rng, by_kind(p, hard, np.ones(len(k)), self.kind[k], self.kinds), n)]
         return ref.first[k] + 1 + (rng.random(n) * (ref.still[k] - 1)).astype(int)
+
+    def hardness(self, k):
+        """min(h / ⟨h⟩, MOST) of the sequences k, by their numbers of failures a step.  -> (len(k),)"""
+        h = np.maximum(self.failed[k] / self.lived[k], 1e-6)
+        return np.minimum(h / h.mean(), MOST)
 
     def first_frames(self, rng, n):
         """Frames (n,) among the first EARLY of sequences that begin in motion."""
-        k = self.moving
-        h = np.maximum(self.failed[k] / self.lived[k], 1e-6)
-        cdf = np.cumsum(1.0 + np.minimum(h / h.mean(), MOST))
-        k = k[np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right").clip(0, len(k) - 1)]
+        k = self.moving[drawn(rng, 1.0 + self.hardness(self.moving), n)]
         return self.ref.first[k] + 1 + rng.integers(0, EARLY, n)
 
     def count(self, rng, frames, failed, steps):
@@ -207,6 +207,12 @@ class Curriculum(Uniform):
             raise ValueError("env.starts.failed or lived is negative")
         for name, value in arrays.items():
             getattr(self, name)[:] = value
+
+
+def drawn(rng, weights, n) -> np.ndarray:
+    """n indices by their weights (S,) >= 0.  Test: tests/extras/test_train.py::test_balanced_starts"""
+    cdf = np.cumsum(weights)
+    return np.searchsorted(cdf, cdf[-1] * rng.random(n), side="right").clip(0, len(cdf) - 1)
 
 
 def by_kind(p, failing, size, kind, share):
@@ -311,7 +317,7 @@ def clips_of(opt: Options) -> list:
     reading, single, clips, runs, few = Reading.of(opt), [], [], [], []
     data.check_unseen(data.parts(opt.motion), "train")
     if opt.players:
-        body.check_players(opt.players)
+        body.recordings_of(opt.players)
     for each in data.parts(opt.motion):  # as `data.sequences`, but the single clips are wanted, too, and read once
         say(f"reading {each}")
         found = data.load(each, clips=opt.clips, split="train", reading=reading)

@@ -172,13 +172,15 @@ def two_bone_arm(shoulder, wrist, elbow, a, b):
     return upper * half_turn, fore * half_turn
 
 
-def check_players(folder):
-    """UserError unless there are recordings in a folder, or it is one: said before other motions are read.
+def recordings_of(folder) -> list:
+    """The recordings of a folder, or the one that it is.  UserError, before anything is read: there are none
 
     Test      tests/headset/test_body.py::test_recordings"""
-    if not os.path.exists(folder) or not files_of(folder):
+    files = files_of(folder) if os.path.exists(folder) else []
+    if not files:
         why = "no recordings" if os.path.exists(folder) else "no such file or folder"
         raise UserError(f"--players {folder}: {why}; valid: .csv or .bsor files that `play.py --stream` reads")
+    return files
 
 
 def players(folder) -> list[Clip]:
@@ -198,9 +200,7 @@ def players(folder) -> list[Clip]:
             raise UserError(f"{file}: the headset is {height:.2f} m up; valid: 1.0 to 2.1 m, the floor at 0")
         return embodied(pos, quat, file.stem)
 
-    check_players(folder)
-    files = files_of(folder)
-    out, broken = sound(embody, files)
+    out, broken = sound(embody, recordings_of(folder))
     for error in broken:
         print(f"left out: {error}")
     return out

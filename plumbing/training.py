@@ -162,12 +162,11 @@ def check_same(seen, now, out):
         told = [{k: v for k, v in a.items() if k != "tables"} if isinstance(a, dict) else a for a in (seen, now)]
         changed = f"the motions have changed since the run began ({told[0]} against {told[1]})"
         raise UserError(f"{out}: {changed}; start a new run with --init {out}")
-    before, tables = seen.get("tables"), now.get("tables")
-    if isinstance(before, dict) and tables is not None:  # runs of before 2026-12 kept none
-        if odd := [name for name in sorted({*before, *tables}) if before.get(name) != tables.get(name)]:
-            was = f"{', '.join(f'[{name}]' for name in odd)} of the character's TOML changed since the run began"
-            back = f"put it back, as {CONFIG} has it, or start a new run with --init {out}"
-            raise UserError(f"{out}: {was}; {back}")
+    tables = now.get("tables", {})
+    before = seen["tables"] if isinstance(seen.get("tables"), dict) else tables  # runs of before 2026-12 kept none
+    if odd := [f"[{name}]" for name in sorted({*before, *tables}) if before.get(name) != tables.get(name)]:
+        was = f"{', '.join(odd)} of the character's TOML changed since the run began"
+        raise UserError(f"{out}: {was}; put it back, as {CONFIG} has it, or start a new run with --init {out}")
 
 
 def progress_line(stats) -> dict:
