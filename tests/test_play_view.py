@@ -48,6 +48,12 @@ def get(url):
         return answer.status, answer.read()
 
 
+def listens(port) -> bool:
+    """Whether anything takes connections there."""
+    with socket.socket() as s:
+        return s.connect_ex((play.LOOPBACK, port)) == 0
+
+
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     """The run folder of an untrained policy: one tiny update."""
@@ -72,6 +78,7 @@ def serving(policy, folder):
         server = subprocess.Popen(command, cwd=ROOT, env=env, stdout=out, stderr=subprocess.STDOUT, preexec_fn=hear)
     try:
         wait_for("URL", lambda: server.poll() is not None or f"http://localhost:{port}/" in log.read_text())
+        wait_for("answer", lambda: server.poll() is not None or listens(port))  # it prints its URL before it listens
         assert server.poll() is None, log.read_text()
         yield server, port, log
     finally:
