@@ -46,7 +46,7 @@ from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_acti
 from mocap.augment import looking, resize
 from mocap.data import CONTROL_RATE
 from mocap.rigs import Reading
-from plumbing.cli import NONNEGATIVE, PNG, POSITIVE, UserError, arg, cli, given_flags, printable, run_main
+from plumbing.cli import NONNEGATIVE, PNG, POSITIVE, UserError, arg, cli, complain, given_flags, printable, run_main
 from plumbing.files import atomic_write, check_folders
 from policy import check_fits
 from retarget import Reference, forward_kinematics
@@ -612,8 +612,7 @@ def play_recordings(char: Character, policy, path, devices: int, opt: Options) -
         print(line_of(printable(name), ends, row))
     ends = sum((r.ends for r in rides), Counter())
     print(line_of(f"all {len(rides)}, completed {found['all']['completed']:.2f}", ends, found["all"]))
-    print(*broken, sep="\n", end="\n" if broken else "")
-    return int(bool(broken))
+    return complain(broken)
 
 
 def line_of(name, ends, row) -> str:

@@ -38,7 +38,7 @@ from headset.reader import SAMPLE_RATE, Sample, sound
 from mocap.data import CONTROL_RATE, MotionFlags, load, parts
 from mocap.rigs import Reading
 from play import recordings_of
-from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cell, cli, markdown, run_main
+from plumbing.cli import NONNEGATIVE, POSITIVE, THREADS, UserError, arg, cell, cli, complain, markdown, run_main
 from plumbing.files import atomic_write, check_folders
 from retarget import sensor_scale
 
@@ -243,8 +243,7 @@ def main(argv=None) -> int:
     for title, rows_ in found.items():
         n = next(iter(next(iter(rows_.values())).values()))["captures"]
         print(f"{title}: {n} captures\n\n{table(rows_)}\n")
-    print(*broken, sep="\n", end="\n" if broken else "")
-    return int(bool(broken))
+    return complain(broken)
 
 
 if __name__ == "__main__":

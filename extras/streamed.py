@@ -32,7 +32,7 @@ from headset.player import Player, stream_of
 from headset.reader import Sample, sound
 from human import sensors
 from mocap.data import CONTROL_RATE
-from plumbing.cli import THREADS, UserError, arg, cell, cli, markdown, run_main
+from plumbing.cli import THREADS, UserError, arg, cell, cli, complain, markdown, run_main
 from plumbing.files import atomic_write, check_folders
 from policy import check_fits, devices_of, find_policy, load_character
 
@@ -180,8 +180,9 @@ def recorded(char: Character, folder, devices: int) -> tuple[dict, list[str]]:
     return by_source, broken
 
 
-def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, devices: int):
-    """(title, numbers) of every row, one after the other: the sets, all of them together, no torque, the streams.
+def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, devices: int, idle=True):
+    """(title, numbers) of every row, one after the other: the sets, all of them together, no torque (if `idle`), the
+    streams.
 
     Test      tests/extras/test_streamed.py::test_command, test_rounds"""
     still = lambda obs: np.zeros((len(obs), len(char.limits)))  # noqa: E731
@@ -198,7 +199,7 @@ def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, d
     if opt.rounds > 1:
         made = {name: [stream_of(char, clip, devices)[:2] for clip in clips] for name, clips in captures.items()}
         captures = {name: put_off(several, opt.rounds) for name, several in made.items()}
-    for title, drive in (("all", act), ("all, no torque", still)):
+    for title, drive in (("all", act), ("all, no torque", still))[: 1 + idle]:
         rows = []
         for name, clips in captures.items():
             rows.append(row_of(drive, clips))
@@ -235,6 +236,7 @@ def main(argv=None) -> int:
     if gone := [one.title for one in sets if not captures.get(one.title)]:
         print(f"{f'--mocap {folder} is' if folder else 'no --mocap:'} without {'; '.join(gone)}", flush=True)
     captures, out, broken = {title: clips for title, clips in captures.items() if clips}, {}, []
+    bodies = set()  # that "no torque" was told of: it is the same for all policies of one
     for policy, path, char, devices in cast:
         streams = {"motionless, a minute": [motionless(char, devices)]}
         if opt.recordings:
@@ -244,15 +246,15 @@ def main(argv=None) -> int:
         print(f"\n{path}, {metrics.name_of(char)}, {which}{f', {opt.rounds} rounds' if opt.rounds > 1 else ''}\n")
         columns = COLUMNS if opt.rounds == 1 else OF_ROUNDS
         print(markdown([["", *(heading for _, heading, _ in columns)]]), flush=True)
-        for title, row in rows_of(char, policy.mean_action, captures, streams, opt, devices):
+        body = (char.path, str(char.variant), devices)
+        idle, bodies = body not in bodies, bodies | {body}
+        for title, row in rows_of(char, policy.mean_action, captures, streams, opt, devices, idle):
             out[f"{path}: {title}"] = row
             cells = (cell(row.get(key, np.nan), form) for key, _, form in columns)
             print("| " + " | ".join([title, *cells]) + " |", flush=True)
     if opt.json:
         atomic_write(opt.json, metrics.as_json(out))
-    told = [*thin, *broken]
-    print(*told, sep="\n", end="\n" if told else "")
-    return int(bool(told))
+    return complain([*thin, *broken])
 
 
 if __name__ == "__main__":

@@ -35,6 +35,15 @@ def printable(text) -> str:
     return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
+def complain(lines) -> int:
+    """Name on stderr what of many files cannot be used, when the rest is done.  -> exit status: 1 if there is any
+
+    Test      tests/headset/test_stream.py::test_folder_of_recordings"""
+    for line in lines:
+        print(f"error: {line}", file=sys.stderr)
+    return int(bool(lines))
+
+
 def run_main(main_fn, argv=None):
     """Call main_fn(argv), then exit: its own int; 2 and one line for a UserError, too little memory or a name of a
     file that no system takes; 130 on Ctrl-C.

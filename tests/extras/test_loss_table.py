@@ -88,7 +88,7 @@ def test_a_broken_recording(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(losses, "rows", lambda: [losses.Loss()])
     flags = ["--characters", "jesse", "--most", "3", "--seconds", "3", "--threads", "1", "--clips", "walk_105"]
     assert losses.main([*flags, "--stream", str(tmp_path), "--json", str(tmp_path / "o.json")]) == 1
-    *_, bad, short = capsys.readouterr().out.splitlines()
+    *_, bad, short = capsys.readouterr().err.splitlines()
     assert "bad.csv" in bad and "short.csv" in short
     assert json.loads((tmp_path / "o.json").read_text())[tmp_path.name]["nothing"]["jesse"]["captures"] == 1
     (tmp_path / "good.csv").unlink()

@@ -853,9 +853,9 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
     (tmp_path / "gone.csv").symlink_to(tmp_path / "nothing")
     (tmp_path / "sub" / "b.csv").rename(tmp_path / "b\x1b[31m\udcff.csv")
     code, found = played(tmp_path)
-    told = capsys.readouterr().out
-    assert code == 1 and len(found["files"]) == 2 and "broken.csv, line 1: no column" in told
-    assert "gone.csv: no such file" in told and "\nb\\x1b[31m\\udcff.csv: " in told
+    told, wrong = capsys.readouterr()
+    assert code == 1 and len(found["files"]) == 2 and "broken.csv, line 1: no column" in wrong
+    assert "gone.csv: no such file" in wrong and "\nb\\x1b[31m\\udcff.csv: " in told
     rows[60:90, 1:8] = np.nan  # the headset, from 2 to 3 s
     np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header=",".join(names), comments="", fmt="%.9g")
     [row] = played(tmp_path / "a.csv")[1]["files"].values()
