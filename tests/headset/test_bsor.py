@@ -232,8 +232,8 @@ def test_folder_and_single_file(tmp_path, capsys):
     flags = ["--character", "jesse", "--policy", str(policy), "--threads", "1", "--json", str(tmp_path / "o.json")]
     with pytest.raises(SystemExit) as end:
         run_main(play.main, [*flags, "--stream", str(folder)])
-    out, found = capsys.readouterr().out, json.loads((tmp_path / "o.json").read_text())
-    assert end.value.code == 1 and "c.bsor, byte " in out and set(found["files"]) == {"a.csv", "b.BSOR"}
+    wrong, found = capsys.readouterr().err, json.loads((tmp_path / "o.json").read_text())
+    assert end.value.code == 1 and "c.bsor, byte " in wrong and set(found["files"]) == {"a.csv", "b.BSOR"}
     for key, value in found["files"]["a.csv"].items():
         same = found["files"]["b.BSOR"][key]
         assert same == value or same == pytest.approx(value, rel=0.2), key
