@@ -36,11 +36,11 @@ import mocap.data
 import retarget
 from character import CHARACTERS, Character
 from env import EPISODE_STEPS, ROOT_LIMIT, Env
-from headset import axes, calibration
+from headset import axes
 from headset.axes import StreamFlags
 from headset.bsor import opened
-from headset.player import Pace, Player, drive, ride, stream_of, tally
-from headset.reader import DEVICES, GAP, arriving, files_of, is_live, sound
+from headset.player import Pace, Player, drive, ride, source_of, stream_of, tally, ticks_of
+from headset.reader import GAP, arriving, files_of, is_live, sound
 from human import heading
 from metrics import ROWS, Arm, Push, Recording, name_of, parse_push, policy_action, simulate
 from mocap.augment import looking, resize
@@ -518,40 +518,6 @@ def recordings_of(path) -> list[Path]:
     return files
 
 
-def source_of(char: Character, path, devices: int, opt: Options):
-    """The stream's reading as the options say, or as fits it best; and that choice, with what to say about it.
-
-    Test      tests/headset/test_stream.py::test_axes_are_found"""
-    order = tuple(map(DEVICES.index, opt.devices)) if opt.devices else None
-    how = axes.choose(path, opt.axes, opt.grip, opt.stream_unit, order, devices)
-    source = calibration.Stream(
-        char,
-        how.axes,
-        sample_rate=opt.sample_rate,
-        grip=how.grip,
-        user_height=opt.user_height,
-        devices=devices,
-        unit=how.unit,
-        order=how.order,
-    )
-    return source, how
-
-
-def ticks_of(char: Character, path, devices: int, opt: Options):
-    """A recording's pos (T, 3, 3), quat (T, 3, 4) at the control rate, in the character's world; each device's lost s.
-
-    Raises    UserError: it cannot be read, or shows no headset for a second
-    Test      tests/headset/test_stream.py::test_folder_of_recordings"""
-    source, how = source_of(char, path, devices, opt)
-    ticks = [tick for sample in opened(path, devices=devices)[1] for tick in source.push(sample)]
-    if not ticks:
-        raise UserError(f"{path}: {source.uncalibrated()}")
-    say(how.told, path)
-    say(source.times(), path)
-    ticks = ticks[: max(1, round(opt.seconds * CONTROL_RATE)) if opt.seconds else None]
-    return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks]), source.guard.lost()
-
-
 def slides_of(char: Character, ride) -> np.ndarray:
     """`metrics.own_slide` of a ride, without the jumps to where it was stood up anew.
 
@@ -563,31 +529,41 @@ def slides_of(char: Character, ride) -> np.ndarray:
     return np.concatenate([metrics.own_slide(soles[a:b], contact[a:b], CONTROL_RATE) for a, b in ride.lives])
 
 
-def errors_of(rides, slides, devices: int) -> dict:
+def errors_of(rides, slides, held) -> dict:
     """Means over all ticks of several rides; nan where there is nothing to tell of.
 
-    Args      slides : `slides_of` each
+    Args      slides : `slides_of` each; held : bool each, whether its controllers were in the user's hands, or of all
     Test      tests/headset/test_stream.py::test_slides_as_measured"""
-    ticks, slides = sum(len(r.qpos) for r in rides), np.concatenate(slides)
+    ticks, slides = np.array([len(r.qpos) for r in rides]), np.concatenate(slides)
+    with_hands = ticks * np.broadcast_to(held, len(rides))
+    hands = np.array([r.hands / len(r.qpos) for r in rides]) @ with_hands
     return {
-        "head_cm": 100 * sum(r.head for r in rides) / ticks,
-        "hands_cm": 100 * sum(r.hands for r in rides) / ticks if devices == 3 else float("nan"),
+        "head_cm": 100 * sum(r.head for r in rides) / ticks.sum(),
+        "hands_cm": 100 * hands / with_hands.sum() if with_hands.any() else float("nan"),
         "own_slide_cm_s": 100 * float(slides.mean()) if len(slides) else float("nan"),
     }
 
 
-def summary_of(rides, slides, devices: int) -> dict:
+def summary_of(rides, slides, held) -> dict:
     """Seconds, failures and errors of one ride, or of several together; `completed` is the share of them.
 
-    Args      slides : `slides_of` each
+    Args      slides, held : as `errors_of`
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
     counts = tally(rides)
     return {
         "seconds": round(counts["seconds"], 3),
         **{k: counts[k] for k in ("completed", "survival", "failures")},
         "fails_every_s": counts["fails_every_s"] if counts["failures"] else None,
-        **{k: None if np.isnan(v) else v for k, v in errors_of(rides, slides, devices).items()},
+        **{k: None if np.isnan(v) else v for k, v in errors_of(rides, slides, held).items()},
     }
+
+
+def in_hand(told, seconds, devices: int) -> bool:
+    """Whether a recording's controllers were the user's for half the time: else what stands in for them hangs.
+
+    Args      told : as `ticks_of` has it
+    Test      tests/headset/test_stream.py::test_folder_of_recordings"""
+    return devices == 3 and told["lost_s"]["left"] + told["lost_s"]["right"] <= seconds
 
 
 def play_recordings(char: Character, policy, path, devices: int, opt: Options) -> int:
@@ -596,22 +572,27 @@ def play_recordings(char: Character, policy, path, devices: int, opt: Options) -
     A file that is no recording is named in a line and left out.  -> exit status, 1 if there was one
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
     check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
-    read = 1 if opt.sensors == "hmd" else devices
-    taken, broken = sound(lambda file: (file, ticks_of(char, file, read, opt)), recordings_of(opt.stream))
+    read, found = 1 if opt.sensors == "hmd" else devices, recordings_of(opt.stream)
+    taken, broken = sound(lambda file: (file, ticks_of(char, file, read, opt)), found)
     files, streams = zip(*taken, strict=True)
-    rides = ride(char, policy.mean_action, [s[:2] for s in streams], devices, opt.threads)
     top, many = Path(opt.stream), os.path.isdir(opt.stream)
-    names = [str(f.relative_to(top)) if many else f.name for f in files]
-    slides = [slides_of(char, r) for r in rides]
-    lost = [{"lost_s": s[2]} for s in streams]
-    each = (summary_of([r], [s], read) | {"completed": r.failures == 0} | k for r, s, k in zip(rides, slides, lost))
-    found = {"files": dict(zip(names, each)), "all": summary_of(rides, slides, read)}
+    names = {f: str(f.relative_to(top)) if many else f.name for f in found}
+    for file, (*_, told) in taken:
+        say(told["notes"], names[file])
+    rides = ride(char, policy.mean_action, [s[:2] for s in streams], devices, opt.threads)
+    slides, ours = [slides_of(char, r) for r in rides], [s[2] for s in streams]
+    held = [in_hand(told, len(r.qpos) / CONTROL_RATE, read) for told, r in zip(ours, rides)]
+    rows = (summary_of([r], [s], h) | {"completed": r.failures == 0} for r, s, h in zip(rides, slides, held))
+    each = {names[file]: row | told for file, row, told in zip(files, rows, ours)}
+    refused = dict(zip([names[f] for f in found if f not in files], broken, strict=True))
+    everything = {"files": each, "all": summary_of(rides, slides, held), "refused": refused}
     if opt.json:
-        atomic_write(opt.json, json.dumps(found, indent=2, allow_nan=False) + "\n")
-    for name, ends, row in zip(names, [r.ends for r in rides], found["files"].values()):
-        print(line_of(printable(name), ends, row))
+        atomic_write(opt.json, json.dumps(everything, indent=2, allow_nan=False) + "\n")
+    for name, r in zip(each, rides, strict=True):
+        print(line_of(printable(name), r.ends, each[name]))
+    whole = f"all {len(rides)}{f' of {len(found)}, {len(refused)} refused' if refused else ''}"
     ends = sum((r.ends for r in rides), Counter())
-    print(line_of(f"all {len(rides)}, completed {found['all']['completed']:.2f}", ends, found["all"]))
+    print(line_of(f"{whole}, completed {everything['all']['completed']:.2f}", ends, everything["all"]))
     return complain(broken)
 
 

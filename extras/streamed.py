@@ -28,7 +28,7 @@ import play
 from character import Character
 from extras.users import row_of_streams
 from headset.calibration import Stream
-from headset.player import Player, stream_of
+from headset.player import Player, stream_of, ticks_of
 from headset.reader import Sample, sound
 from human import sensors
 from mocap.data import CONTROL_RATE
@@ -174,8 +174,9 @@ def recorded(char: Character, folder, devices: int) -> tuple[dict, list[str]]:
 
     Test      tests/extras/test_streamed.py::test_recordings"""
     by_source, flags = {}, play.Options(stream=str(folder))
-    taken, broken = sound(lambda file: (file, play.ticks_of(char, file, devices, flags)), play.recordings_of(folder))
+    taken, broken = sound(lambda file: (file, ticks_of(char, file, devices, flags)), play.recordings_of(folder))
     for file, stream in taken:
+        play.say(stream[2]["notes"], file)
         by_source.setdefault(f"recordings: {file.stem.partition('_')[0]}", []).append(stream[:2])
     return by_source, broken
 

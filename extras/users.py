@@ -170,7 +170,7 @@ def row_of_streams(char: Character, act, streams, devices, threads, push=None) -
         "falls": ends["fall"],
         "lost": ends["away"],
         "diverged": ends["bad"],
-        **errors_of(rides, [slides_of(char, r) for r in rides], devices),
+        **errors_of(rides, [slides_of(char, r) for r in rides], devices == 3),
     }
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from character import Character
-from headset.reader import AXES, GAP, SAMPLE_RATE, Clock, Guard, Sample, blend, to_frame, to_world
+from headset.reader import AXES, GAP, REACH, SAMPLE_RATE, Clock, Guard, Sample, blend, to_frame, to_world
 from human import heading, quat_about
 from mocap.data import CONTROL_RATE
 from plumbing.cli import UserError
@@ -46,6 +46,7 @@ CALIBRATION, SEEN = 1.0, 1000  # s of headset; readings kept of it: of a faster 
 AGAIN = 0.5  # s without a headset, the way back included: put on meanwhile, so the second begins again.  ASSUMED
 STANDING = (1.0, 2.1)  # m, where the headset of a standing user may be (recorded: 1.37 to 2.00); else no floor at 0
 AVERAGE = 1.64  # m, headset of a user of 1.75 m, taken where the floor is not known.  ASSUMED
+ABOVE = 0.25  # m: whose headset is so far above the calibrated height for a second had not stood upright.  ASSUMED
 HIPS = 0.554  # of that height: the hips, which a headset does not see, for `scale_z = "hip"`.  ASSUMED
 
 
@@ -119,6 +120,7 @@ class Stream:
         self.clock, self.told_rate = Clock(sample_rate or SAMPLE_RATE), sample_rate
         self.guard, self.resampler = Guard(rate, devices), Resampler(rate)
         self.calibration, self.seen, self.unseen, self.rows = None, [], 0.0, 0
+        self.above = 0.0  # s for which the headset was ABOVE the calibrated height, or higher
 
     def push(self, sample: Sample) -> list[Sample]:
         """The ticks that a reading completes; none in the first second, which calibrates."""
@@ -140,7 +142,9 @@ class Stream:
         ticks = []
         for s in self.guard.push(sample, why):
             if self.calibration:
-                ticks += [self.calibration.apply(tick) for tick in self.resampler.push(s)]
+                made, top = self.resampler.push(s), self.calibration.floor + self.calibration.height
+                self.above += (s.pos[0, 2] > top + ABOVE) * len(made) / self.resampler.rate
+                ticks += [self.calibration.apply(tick) for tick in made]
             elif self.guard.live():
                 gap = s.t - self.seen[-1][0] if self.seen else 0.0
                 self.unseen += max(0.0, gap - GAP)
@@ -171,13 +175,27 @@ class Stream:
         why = f"; of them {', '.join(bad)}" if bad else ""
         return f"{self.rows} rows show the headset for {self.tracked():.2f} s; {need}{why}"
 
-    def times(self) -> list[str]:
-        """What is to be said of the rows' times.  Test: tests/headset/test_stream.py::test_sample_rate"""
+    def remarks(self) -> list[str]:
+        """What is to be said of the rows' times, of a user who crouched while calibrating, of controllers elsewhere.
+
+        Test      tests/headset/test_stream.py::test_sample_rate, test_remarks"""
         if self.rows and not self.clock.timed:
             return [f"no time column: {self.clock.rate:g} rows a second (--sample-rate)"]
         lines = ["the stream has times: --sample-rate is not used"] if self.rows and self.told_rate else []
         counts = {"rows before their predecessor": self.clock.dropped, "jumps of the clock": self.clock.jumps}
-        return lines + [f"{n} {what}" for what, n in counts.items() if n]
+        lines += [f"{n} {what}" for what, n in counts.items() if n]
+        if self.above > 1.0:
+            lines.append(
+                f"for {self.above:.1f} s the headset is {ABOVE} m or more over its place in the first second, which is "
+                "taken for the user's height: stand upright then, or cut the file to where the user does"
+            )
+        away = sum(s for (_, what), s in self.guard.seconds.items() if what == "out of reach")
+        if away > (self.guard.t or 0.0):  # of both hands together: half the time of each
+            lines.append(
+                f"the controllers are {REACH} m or more from the headset most of the time; valid: all three in one "
+                "frame, not relative to the headset, in metres or with --stream-unit"
+            )
+        return lines
 
     def report(self) -> list[str]:
         """What was calibrated and what went wrong, for a reader.
@@ -190,4 +208,4 @@ class Stream:
                 f"user's headset {c.height:.2f} m above the floor; floor at {c.floor:.2f} m ({how}); "
                 f"forward {np.degrees(c.yaw):.0f} degrees; heights times {c.scale[2]:.3f}"
             )
-        return lines + self.times() + self.guard.report()
+        return lines + self.remarks() + self.guard.report()

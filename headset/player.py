@@ -27,9 +27,11 @@ import numpy as np
 
 from character import Character, geom_lowest
 from env import BAD, FORCE_LIMIT, SUBSTEPS, fallen, observation_terms, observe, slices_of
+from headset import axes
+from headset.bsor import opened
 from headset.calibration import Stream
 from headset.losses import lose
-from headset.reader import FAR_AWAY, Sample
+from headset.reader import DEVICES, FAR_AWAY, GRIP, Sample
 from human import Clip, heading, place, quat_about, quat_matrix, quat_rotate, sensors
 from mocap.augment import begins_in_motion, lead
 from mocap.data import CONTROL_RATE
@@ -301,6 +303,54 @@ def stream_of(char: Character, clip, devices=3, hang=False):
         raise UserError(f"{clip.name}: {stream.uncalibrated()}")
     seen = place(led, -c.yaw, c.origin[:2], np.zeros(2))[len(led) - len(ticks) :]
     return np.stack([t.pos for t in ticks]), np.stack([t.quat for t in ticks]), seen, c.scale
+
+
+def source_of(char: Character, path, devices: int, opt: axes.StreamFlags):
+    """The stream's reading as the options say, or as fits it best; and that choice, with what to say about it.
+
+    Test      tests/headset/test_stream.py::test_axes_are_found"""
+    order = tuple(map(DEVICES.index, opt.devices)) if opt.devices else None
+    how = axes.choose(path, opt.axes, opt.grip, opt.stream_unit, order, devices)
+    source = Stream(
+        char,
+        how.axes,
+        sample_rate=opt.sample_rate,
+        grip=how.grip,
+        user_height=opt.user_height,
+        devices=devices,
+        unit=how.unit,
+        order=how.order,
+    )
+    return source, how
+
+
+def ticks_of(char: Character, path, devices: int, opt: axes.StreamFlags):
+    """A recording's pos (T, 3, 3), quat (T, 3, 4) at the control rate, in the character's world; and how it was read.
+
+    Args      opt : with `seconds`, how much of it, or None
+    Returns   pos, quat; a dict of axes, grip [degrees], notes (what is to be said of it), lost_s (of each device, while
+              it was played)
+    Raises    UserError: it cannot be read, or shows no headset for a second
+    Test      tests/headset/test_stream.py::test_folder_of_recordings"""
+    source, how = source_of(char, path, devices, opt)
+    reader, samples = opened(path, devices=devices)
+    ticks, before, last = [], {}, max(1, round(opt.seconds * CONTROL_RATE)) if opt.seconds else None
+    for sample in samples:
+        ticks += source.push(sample)
+        if not before and source.calibration:
+            before = source.guard.lost()
+        if last and len(ticks) >= last:
+            break
+    if not ticks:
+        raise UserError(f"{path}: {source.uncalibrated()}")
+    cut = ["its last line is cut short: left out"] if reader.unreadable else []
+    told = {
+        "axes": how.axes,
+        "grip": GRIP[how.axes] if how.grip is None else how.grip,
+        "notes": [*how.told, *source.remarks(), *cut],
+        "lost_s": {device: round(s - before[device], 3) for device, s in source.guard.lost().items()},
+    }
+    return np.stack([t.pos for t in ticks[:last]]), np.stack([t.quat for t in ticks[:last]]), told
 
 
 @dataclass

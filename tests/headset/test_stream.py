@@ -26,7 +26,7 @@ from env import Env, headset_only, observation_terms
 from headset import calibration
 from headset.axes import Watch
 from headset.calibration import Calibration, Resampler, Stream
-from headset.player import Pace, Player, Ride, drive, ride, stream_of, tally
+from headset.player import Pace, Player, Ride, drive, ride, source_of, stream_of, tally, ticks_of
 from headset.reader import (
     AXES,
     COAST,
@@ -353,22 +353,42 @@ def test_unordered_times():
     assert [constant.stamp(1.0) for _ in range(200)][-1] > 1.5  # a time column that stands still does not stop time
 
 
-def test_sample_rate(jesse, walk, tmp_path, capsys):
+def test_sample_rate(jesse, walk, tmp_path):
     """Rows without times are so many a second, which is said; a rate for rows with times is not used, which is, too."""
     lines, path = to_csv(np.arange(len(walk)) / walk.rate, *sensors(walk)), tmp_path / "a.csv"
     timeless = [line.split(",", 1)[1] for line in lines]
     for text, rate, said in (
         (lines, None, ""),
-        (lines, 30.0, f"{path}: the stream has times: --sample-rate is not used\n"),
-        (timeless, None, f"{path}: no time column: 90 rows a second (--sample-rate)\n"),
-        (timeless, 30.0, f"{path}: no time column: 30 rows a second (--sample-rate)\n"),
+        (lines, 30.0, "the stream has times: --sample-rate is not used"),
+        (timeless, None, "no time column: 90 rows a second (--sample-rate)"),
+        (timeless, 30.0, "no time column: 30 rows a second (--sample-rate)"),
     ):
         path.write_text("".join(text))
-        pos, *_ = play.ticks_of(jesse, path, 3, play.Options(axes="mujoco", grip=90.0, sample_rate=rate))
-        assert capsys.readouterr().out == said
+        pos, _, told = ticks_of(jesse, path, 3, play.Options(axes="mujoco", grip=90.0, sample_rate=rate))
+        assert told["notes"] == ([said] if said else []) and (told["axes"], told["grip"]) == ("mujoco", 90.0)
         assert abs(len(pos) - (len(walk) / (3 if text is timeless and not rate else 1) - 30)) <= 2
-    short, *_ = play.ticks_of(jesse, path, 3, play.Options(axes="mujoco", grip=90.0, seconds=0.01))
+    short, *_ = ticks_of(jesse, path, 3, play.Options(axes="mujoco", grip=90.0, seconds=0.01))
     assert len(short) == 1
+
+
+def test_remarks(jesse, walk, tmp_path):
+    """Who crouches while calibrating, controllers relative to the headset, a row that is cut: each is said."""
+    pos, quat = sensors(walk)
+    pos, path = np.concatenate([pos, pos[-1:].repeat(60, 0)]), tmp_path / "a.csv"
+    quat, t = np.concatenate([quat, quat[-1:].repeat(60, 0)]), np.arange(len(pos)) / walk.rate
+    low, relative = pos.copy(), pos.copy()
+    low[: round(1.5 * walk.rate), :, 2] *= 0.55
+    relative[:, 1:] -= pos[:, :1]
+    for given, end, said in (
+        (pos, "\n", []),
+        (low, "\n", ["over its place in the first second"]),
+        (relative, "\n", ["not relative to the headset"]),
+        (pos, "", ["its last line is cut short: left out"]),
+    ):
+        lines = to_csv(t, given, quat)
+        path.write_text("".join(lines)[: None if end else -40])
+        notes = ticks_of(jesse, path, 3, play.Options(axes="mujoco", grip=90.0))[2]["notes"]
+        assert len(notes) == len(said) and all(any(s in n for n in notes) for s in said), notes
 
 
 def test_another_clock():
@@ -557,8 +577,9 @@ def test_calibration(jesse):
         pos = np.tile([4.0, -2.0, height + raised], (100, 1)) - np.linspace(0, 0.01, 100)[:, None] * [0, 0, 1]
         c = calibration.calibrate(jesse, pos, np.tile(turn, (100, 1)))
         plausible = raised == 0 and height < 2.1
-        assert c.estimated is not plausible and np.isclose(c.height, height if plausible else calibration.AVERAGE,
-        atol=0.01)
+        assert c.estimated is not plausible and np.isclose(
+            c.height, height if plausible else calibration.AVERAGE, atol=0.01
+        )
         out = c.apply(Sample(0.0, np.tile(pos[:1], (3, 1)), np.tile(turn, (3, 1))))
         assert np.allclose(out.pos, [0, 0, retarget.headset(jesse)[2]], atol=0.01)
         assert np.allclose(np.abs(out.quat), [1, 0, 0, 0], atol=1e-9)
@@ -834,10 +855,12 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
     code, found = played(tmp_path)
     assert code == 0 and set(found["files"]) == {"a.csv", "sub/b.csv"} and set(found["all"]) == set(play.OF_FILE)
     told = capsys.readouterr().out.splitlines()
-    assert told[0].startswith("a.csv: ") and told[2].startswith("all 2, completed ")
+    assert told[0].startswith("a.csv: ") and told[2].startswith("all 2, completed ") and found["refused"] == {}
     for name, row in found["files"].items():
-        assert set(row) == {*play.OF_FILE, "lost_s"} and row["completed"] == (row["failures"] == 0)
-        assert row["lost_s"] == {"head": 0, "left": 0, "right": 0}
+        how = {k: row.pop(k) for k in ("axes", "grip", "notes", "lost_s")}
+        assert set(row) == set(play.OF_FILE) and row["completed"] == (row["failures"] == 0)
+        nothing = {"head": 0, "left": 0, "right": 0}
+        assert how == {"axes": "mujoco", "grip": 90.0, "notes": how["notes"], "lost_s": nothing}
         code, alone = played(tmp_path / name)
         [same] = alone["files"].values()
         assert code == 0 and {k for k in same if same[k] is None} == {k for k in row if row[k] is None}
@@ -856,11 +879,19 @@ def test_folder_of_recordings(jesse, tmp_path, capsys, walk):
     told, wrong = capsys.readouterr()
     assert code == 1 and len(found["files"]) == 2 and "broken.csv, line 1: no column" in wrong
     assert "gone.csv: no such file" in wrong and "\nb\\x1b[31m\\udcff.csv: " in told
+    assert set(found["refused"]) == {"broken.csv", "gone.csv"} and "\nall 2 of 4, 2 refused, completed " in told
+    assert found["refused"]["broken.csv"] in wrong
     rows[60:90, 1:8] = np.nan  # the headset, from 2 to 3 s
     np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header=",".join(names), comments="", fmt="%.9g")
     [row] = played(tmp_path / "a.csv")[1]["files"].values()
     assert row["lost_s"] == {"head": pytest.approx(30 / walk.rate, abs=0.04), "left": 0, "right": 0}
     assert f"; lost: head {row['lost_s']['head']:.1f} s\n" in capsys.readouterr().out
+    rows[:, 8:] = np.nan  # no controllers at all: what stands in for them is nobody's hands
+    np.savetxt(tmp_path / "none.csv", rows, delimiter=",", header=",".join(names), comments="", fmt="%.9g")
+    _, found = played(tmp_path / "none.csv")
+    assert found["files"]["none.csv"]["hands_cm"] is found["all"]["hands_cm"] is None
+    assert found["files"]["none.csv"]["lost_s"]["left"] == pytest.approx(found["all"]["seconds"], abs=0.1)
+    (tmp_path / "none.csv").unlink()
     _, short = played(tmp_path / "a.csv", "--seconds", "1")
     assert short["all"]["seconds"] == 1.0
     (tmp_path / "none").mkdir()
@@ -905,7 +936,7 @@ def test_slides_as_measured(jesse):
     clip, act = load("standing", clips="stand_005")[0], lambda obs: np.zeros((len(obs), len(jesse.limits)))
     rides = ride(jesse, act, [stream_of(jesse, clip)[:2]])
     assert rides[0].failures > 1 and any(rides[0].contact[a + 1].any() for a, _ in rides[0].lives)
-    found = play.summary_of(rides, [play.slides_of(jesse, r) for r in rides], 3)
+    found = play.summary_of(rides, [play.slides_of(jesse, r) for r in rides], True)
     measured = metrics.streamed(jesse, act, [clip])
     for key in ("head_cm", "hands_cm", "own_slide_cm_s"):
         assert found[key] == pytest.approx(measured[key], rel=1e-5), key
@@ -1133,9 +1164,9 @@ def test_axes_are_found(jesse, walk, tmp_path, capsys):
     path = tmp_path / "a.csv"
     for name in ("unity", "openxr"):
         path.write_text("".join(to_csv(*pointing(walk), name)))
-        source, how = play.source_of(jesse, path, 3, play.Options())
+        source, how = source_of(jesse, path, 3, play.Options())
         assert (source.axes, source.grip, source.order) == (name, 15.0, [0, 1, 2]) and how.usual == (name == "unity")
-    source, how = play.source_of(jesse, path, 3, play.Options(axes="unity", devices=("head", "right", "left")))
+    source, how = source_of(jesse, path, 3, play.Options(axes="unity", devices=("head", "right", "left")))
     assert (source.axes, source.order) == ("unity", [0, 2, 1]) and "--axes auto" in how.lines[0]
     samples = list(Reader("x").read(to_csv(*pointing(walk), "unity")))
     assert list(play.watched(samples, Watch("unity"))) == samples
@@ -1144,8 +1175,8 @@ def test_axes_are_found(jesse, walk, tmp_path, capsys):
     assert "--axes" in capsys.readouterr().out
 
 
-def test_what_is_said_of_a_folder(jesse, walk, tmp_path, capsys):
-    """Of many recordings a guess is said, with the file's name, unless it is what most files are."""
+def test_what_is_said_of_a_folder(jesse, walk, tmp_path):
+    """Of many recordings a guess is said, unless it is what most files are."""
     lines = to_csv(*pointing(walk), "unity")
     headset = [",".join(line.strip().split(",")[:8]) + "\n" for line in lines]
     still = [lines[0], *(f"{k / 90},{lines[1].split(',', 1)[1]}" for k in range(200))]  # nobody holds the controllers
@@ -1158,7 +1189,5 @@ def test_what_is_said_of_a_folder(jesse, walk, tmp_path, capsys):
         (still, 3, "not sure"),
     ):
         (tmp_path / "a.csv").write_text("".join(text))
-        play.ticks_of(jesse, tmp_path / "a.csv", devices, play.Options())
-        out = capsys.readouterr().out
-        assert out.startswith(f"{tmp_path / 'a.csv'}: ") if said else not out
-        assert said in out and out.count("\n") == bool(said)
+        notes = ticks_of(jesse, tmp_path / "a.csv", devices, play.Options())[2]["notes"]
+        assert len(notes) == bool(said) and said in "".join(notes)
