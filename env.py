@@ -454,7 +454,7 @@ class Env:
             raise ValueError(f"action has shape {np.shape(action)}, expected {self.action.shape}")
         if not np.isfinite(action).all():
             raise ValueError(f"action of environment {int(np.argmin(np.isfinite(action).all(1)))} is not finite")
-        a = np.clip(action, -1.0, 1.0)  # only the physics sees clipped actions
+        a = np.clip(action, -1.0, 1.0)  # for the physics and Eqs. 9, 10; PPO's log π has what was drawn
         if self.disturbance:
             self.disturbance.step(self)
         self.ctrl[:] = a

@@ -203,15 +203,41 @@ def initial(path, opt, env) -> tuple[Policy, int]:
     A file that is only to be watched has a stub of a critic; the run begins with a new one.
     Args      opt : of the run (`check_exact`), with gamma, min_sigma and seed
     Raises    UserError: of another character, or other sizes
-    Test      tests/test_ppo.py::test_init_fine_tunes, tests/extras/test_arms.py::test_ship"""
+    Test      tests/test_ppo.py::test_init_fine_tunes, test_init_says_what_differs,
+              tests/extras/test_arms.py::test_ship"""
     policy, meta = load_policy(path)
     if policy.value_hidden == STUB != tuple(opt.value_hidden):
         policy = policy.with_critic(opt.value_hidden, np.random.default_rng([opt.seed, 2]))
         print(f"{path}: has no critic, to be small; begins with a new one")
     check_exact(policy, meta, path, opt, env)
+    if notes := trained_otherwise(meta, opt):
+        print(f"note: {path}: {'; '.join(notes)}")
     policy.norm.frozen, policy.value_scale = False, env.value_scale(opt.gamma)
     np.maximum(policy.log_std, np.log(opt.min_sigma), out=policy.log_std)
     return policy, total_steps(meta)
+
+
+LEARNT = ("gamma", "root_limit", "root_lag", "near", "sigma", "min_sigma")  # options that --init does not bring
+
+
+def trained_otherwise(meta, opt) -> list[str]:
+    """What a run that goes on from a policy does not do as the policy was trained, with the flags that would.
+
+    Args      meta : of the policy's file; opt : of the run
+    Test      tests/test_ppo.py::test_init_says_what_differs"""
+    before, flags = meta.get("options"), []
+    before, now = before if isinstance(before, dict) else {}, getattr(opt, "set", None) or ""
+    for name in LEARNT:
+        if hasattr(opt, name) and before.get(name) not in (None, getattr(opt, name)):
+            flags.append(f"--{name.replace('_', '-')} {before[name]}")
+    rewards = meta.get("reward") or [part.strip() for part in (before.get("set") or "").split(";") if part.strip()]
+    tight = lambda text: "".join(str(text).split())  # noqa: E731
+    if odd := [r for r in rewards if tight(r) not in tight(now).split(";")]:
+        flags.append(f'--set "{"; ".join(map(str, odd))}"')
+    notes = [f"was trained with {' '.join(flags)}, which this run has not"] if flags else []
+    if ahead := " ".join(f"--{k} {-meta[k]:g}" for k in ("lead", "damping") if isinstance(meta.get(k), float)):
+        notes.append(f"is shown the user ahead, which a run unlearns: python -m extras.policies ship IN OUT {ahead}")
+    return notes
 
 
 def widths(path, character) -> dict:

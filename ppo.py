@@ -354,7 +354,8 @@ class Trainer:
 
     def data(self) -> dict:
         """What tells whether two runs saw the same.  Test: tests/test_ppo.py::test_resume_refuses_other_tables"""
-        return training.motions(self.env.ref) | {"tables": training.tables_of(self.env.char)}
+        char = self.env.char
+        return training.motions(self.env.ref) | {"tables": training.tables_of(char), "model": training.model_of(char)}
 
     def save(self, path, meta):
         """Everything: policy, optimisers, environment, random states."""

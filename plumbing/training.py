@@ -33,7 +33,7 @@ def read_options(kind, argv, prog, description, widths=None):
     opt = dataclasses.replace(opt, out=opt.out or f"runs/{Path(opt.character).stem}")
     check_run(opt.out, opt.resume)
     if opt.resume:
-        return resumed_options(opt, argv)
+        return with_a_note(resumed_options(opt, argv))
     char, recipe = opt.load(), {}
     if opt.recipe != "none":
         recipe = {k: tuple(v) if isinstance(v, list) else v for k, v in char.training.items() if k != "by"}
@@ -42,9 +42,31 @@ def read_options(kind, argv, prog, description, widths=None):
             f"{char.path}: [training] {', '.join(odd)}: no option of {prog}; "
             'valid: by = "extras.train", which has it, or --recipe none'
         )
+    if told := [f"{k} {shown(v)}" for k, v in recipe.items() if k not in given]:
+        print(f"recipe, [training] of {char.path.name}: {', '.join(told)}")
     if opt.init and widths:
         recipe |= widths(opt.init, opt.character)
     return dataclasses.replace(opt, **{k: v for k, v in recipe.items() if k not in given})
+
+
+def shown(value) -> str:
+    """A hyper-parameter as a command line has it.  Test: tests/test_ppo.py::test_recipe"""
+    return ",".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+
+
+def with_a_note(opt):
+    """The options of a run that goes on; a line where the recipe of today has it otherwise, for it is read but once.
+
+    Test      tests/test_ppo.py::test_resume_refuses_other_tables"""
+    char = opt.load()
+    odd = [
+        f"{k} {shown(getattr(opt, k))} (recipe: {shown(v)})"
+        for k, v in (char.training.items() if opt.recipe != "none" and not opt.init else ())
+        if hasattr(opt, k) and shown(getattr(opt, k)) != shown(v)
+    ]
+    if odd:
+        print(f"goes on as it began, not by today's [training] of {char.path.name}: {', '.join(odd)}")
+    return opt
 
 
 def given_names(argv) -> set:
@@ -72,9 +94,11 @@ def resumed_options(opt, argv, changeable=CHANGEABLE):
         values[f.name] = stored.get(f.name, asked)
         if f.name in given and asked != values[f.name]:
             if f.name not in changeable:
+                recipe = ", given or by its recipe" if own else ""  # DROP's and the skeletal runs have neither
+                anew = f", or start a new run with --init {opt.out}" if own else ""
                 raise UserError(
-                    f"{opt.out}: was started with --{f.name} {values[f.name]}; to resume, leave it out "
-                    f"(can change: {', '.join(changeable[:2])})"
+                    f"{opt.out}: was started with --{f.name.replace('_', '-')} {shown(values[f.name])}{recipe}; "
+                    f"to resume, leave it out (can change: {', '.join(changeable[:2])}){anew}"
                 )
             values[f.name] = asked
     return type(opt)(**values | {"resume": True, "out": opt.out})
@@ -154,12 +178,29 @@ def tables_of(char) -> dict:
     return {name: table for name, table in char.spec.items() if name not in ("training", "metrics")}
 
 
+SOLID = (  # of the compiled model: what the physics of a run hangs on
+    *("body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "geom_size", "geom_pos", "geom_friction"),
+    *("geom_solref", "geom_solimp", "jnt_pos", "jnt_axis", "jnt_range", "dof_armature", "dof_damping", "actuator_gear"),
+)
+
+
+def model_of(char) -> dict:
+    """Name -> fingerprint of the arrays of a character's compiled model.
+
+    Why       its XML can be edited between two launches as its TOML can
+    Test      tests/test_ppo.py::test_resume_refuses_other_tables"""
+    return {name: fingerprint(getattr(char.model, name)) for name in SOLID}
+
+
 def check_same(seen, now, out):
-    """UserError unless a run that is resumed sees the motions, and the character's tables, that it saw before.
+    """UserError unless a run that is resumed sees the motions, and the character's tables and model, that it saw.
 
     Test      tests/test_ppo.py::test_resume_refuses_other_options, test_resume_refuses_other_tables"""
     if not isinstance(seen, dict) or seen.get("fingerprint") != now["fingerprint"]:
-        told = [{k: v for k, v in a.items() if k != "tables"} if isinstance(a, dict) else a for a in (seen, now)]
+        told = [
+            {k: v for k, v in a.items() if k not in ("tables", "model")} if isinstance(a, dict) else a
+            for a in (seen, now)
+        ]
         changed = f"the motions have changed since the run began ({told[0]} against {told[1]})"
         raise UserError(f"{out}: {changed}; start a new run with --init {out}")
     tables = now.get("tables", {})
@@ -167,6 +208,11 @@ def check_same(seen, now, out):
     if odd := [f"[{name}]" for name in sorted({*before, *tables}) if before.get(name) != tables.get(name)]:
         was = f"{', '.join(odd)} of the character's TOML changed since the run began"
         raise UserError(f"{out}: {was}; put it back, as {CONFIG} has it, or start a new run with --init {out}")
+    model = now.get("model", {})
+    before = seen["model"] if isinstance(seen.get("model"), dict) else model  # likewise
+    if odd := [name for name in model if before.get(name) != model[name]]:
+        was = f"{', '.join(odd)} of the character's model (its XML, or the flags) changed since the run began"
+        raise UserError(f"{out}: {was}; put it back, or start a new run with --init {out}")
 
 
 def progress_line(stats) -> dict:

@@ -550,7 +550,7 @@ def test_resume_refuses_other_options(whole, tmp_path, monkeypatch):
     assert before == {p: p.read_bytes() for p in whole.iterdir()}  # refused: untouched
 
 
-def test_resume_refuses_other_tables(tmp_path):
+def test_resume_refuses_other_tables(tmp_path, capsys):
     """A weight that was changed in the TOML is the ablation of a new run, not of the one that goes on."""
     own = tmp_path / "mine.toml"
     shutil.copy(CHARACTERS / "dino.xml", tmp_path)
@@ -566,8 +566,27 @@ def test_resume_refuses_other_tables(tmp_path):
     with pytest.raises(UserError, match=r"\[reward\] of the character's TOML changed.*--init"):
         train(tmp_path / "a", 2, "--resume")
     assert before == {p: p.read_bytes() for p in (tmp_path / "a").iterdir()}  # refused: untouched
+    own.write_text(as_it_was)
+    body = (tmp_path / "dino.xml").read_text()
+    for pattern, other, name in (
+        (r"mass=\"13\"", 'mass="14"', "body_mass"),
+        (r"friction=\"[\d. ]+\"", 'friction="0.2"', "geom_friction"),
+    ):
+        changed = re.sub(pattern, other, body, count=1)
+        assert changed != body
+        (tmp_path / "dino.xml").write_text(changed)
+        with pytest.raises(UserError, match=rf"{name}.* of the character's model.*--init"):
+            train(tmp_path / "a", 2, "--resume")
+    (tmp_path / "dino.xml").write_text(body + "<!-- a comment is no change -->")
+    assert before == {p: p.read_bytes() for p in (tmp_path / "a").iterdir()}
     own.write_text(re.sub(r"(?m)^lr *= .*", "lr = 1e-6", as_it_was))  # the recipe is read once, when a run begins
     train(tmp_path / "a", 2, "--resume")
+    capsys.readouterr()
+    training.with_a_note(Options(character=str(own), recipe="none"))
+    assert not capsys.readouterr().out
+    training.with_a_note(Options(character=str(own), lr=5e-5))
+    assert "not by today's [training] of mine.toml: " in (told := capsys.readouterr().out)
+    assert "lr 5e-05 (recipe: 1e-06)" in told
 
 
 def test_resume_accepts_what_changes_nothing(whole, tmp_path):
@@ -626,6 +645,22 @@ def test_init_fine_tunes(whole, tmp_path, monkeypatch):
     with pytest.raises(UserError, match="no checkpoint"):
         train(tmp_path / "b", 1, "--init", str(tmp_path / "missing.npz"))
     assert not (tmp_path / "b").exists()
+
+
+def test_init_says_what_differs(whole, tmp_path, capsys):
+    """A run that goes on from a policy says by which flags it was trained otherwise, and that it is shown ahead."""
+    train(tmp_path / "a", 1, "--init", str(whole))
+    assert "note: " not in capsys.readouterr().out
+    arrays, meta = load_checkpoint(whole / CHECKPOINT)
+    meta |= {"reward": ["reward.x=[2.0,24.0]"], "damping": 0.025}
+    meta["options"] |= {"gamma": 0.99, "root_limit": 0.9}  # ppo.py alone has no --root-limit
+    save_checkpoint(tmp_path / "b.npz", arrays, meta)
+    train(tmp_path / "c", 1, "--init", str(tmp_path / "b.npz"))
+    [note] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert 'was trained with --gamma 0.99 --set "reward.x=[2.0,24.0]", which this run has not; is shown' in note
+    assert "ship IN OUT --damping -0.025" in note and "--root" not in note
+    train(tmp_path / "d", 1, "--init", str(tmp_path / "b.npz"), "--gamma", "0.99", "--set", "reward.x=[2.0, 24.0]")
+    assert "was trained with" not in capsys.readouterr().out
 
 
 def test_init_brings_its_widths(whole, tmp_path):
@@ -724,14 +759,16 @@ def recipe_options(*argv):
     return training.read_options(Options, list(argv), "ppo.py", "")
 
 
-def test_recipe(tmp_path, monkeypatch):
+def test_recipe(tmp_path, monkeypatch, capsys):
     """The command line wins over the character's [training], that over the defaults; `by` says who trains."""
     monkeypatch.chdir(tmp_path)
     ours = own_recipe(tmp_path, "sigma = 0.06\nlr = 2e-5\nhidden = [24, 12]\nhorizon = 4\ntarget_kl = 1")
     opt = recipe_options("--character", ours, "--lr", "1e-3")
     assert (opt.sigma, opt.lr, opt.hidden, opt.horizon, opt.target_kl) == (0.06, 1e-3, (24, 12), 4, 1)
     assert (opt.min_sigma, opt.value_hidden, opt.out) == (0.05, (256, 128), "runs/own")
+    capsys.readouterr()
     changed = recipe_options("--character", ours, "--set", "training.sigma=0.2")
+    assert "recipe, [training] of own.toml: " in (told := capsys.readouterr().out) and "sigma 0.2" in told
     assert changed.sigma == 0.2 and changed.horizon == 4
     plain = recipe_options("--character", ours, "--recipe", "none")
     assert replace(plain, character="jesse", recipe="character") == Options(out="runs/own")
