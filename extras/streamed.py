@@ -35,6 +35,7 @@ from mocap.data import CONTROL_RATE
 from plumbing.cli import THREADS, UserError, arg, cell, cli, complain, markdown, run_main
 from plumbing.files import atomic_write, check_folders
 from policy import check_fits, devices_of, find_policy, load_character
+from retarget import forward_kinematics, standing
 
 HALVES = [half for half in metrics.HALVES if half != "both"]
 PUT, SHAKEN = 0.012, 0.002  # m, ASSUMED standard deviations of a position error: of a round, of a tick
@@ -83,6 +84,9 @@ COLUMNS = (
         "foot_slide_cm_s", "own_slide_cm_s", "contact_agreement", "self_penetration_mm", "spring_share",
     )),
 )  # fmt: skip
+COLUMNS = tuple(
+    d for c in COLUMNS for d in ([c, ("statue_cm", "hands of a statue cm", "{:.1f}")] if c[0] == "hands_cm" else [c])
+)
 OF_ROUNDS = [c for c in COLUMNS if c[0] not in (
     "within_1m", "root_cm", "foot_slide_cm_s", "contact_agreement", "self_penetration_mm", "spring_share",
 )]  # fmt: skip
@@ -158,6 +162,17 @@ def together(rows) -> dict:
     }
 
 
+def statue(char: Character, streams) -> dict:
+    """The dumbest baseline of the hands: the default pose, put under the user's headset at every tick.
+
+    Args      streams : (pos (T, 3, 3) [m], quat (T, 3, 4)) of each
+    Returns   statue_cm : mean distance of its controllers from the user's
+    Test      tests/extras/test_streamed.py::test_statue"""
+    pos, quat = (np.concatenate([s[k] for s in streams]) for k in (0, 1))
+    sites = forward_kinematics(char, standing(char, pos[:, 0], quat[:, 0])).site_xpos
+    return {"statue_cm": 100 * float(np.linalg.norm(sites[:, 1:] - pos[:, 1:], axis=-1).mean())}
+
+
 def motionless(char: Character, devices: int):
     """The stream of a user who stands as the built-in `standing` motions begin, and does not move.
 
@@ -190,11 +205,12 @@ def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, d
 
     def counted(drive, several):
         row = row_of_streams(char, drive, several, devices, opt.threads)
-        return row | {"clips": row["captures"]}
+        return row | {"clips": row["captures"]} | (statue(char, several) if devices == 3 else {})
 
     def row_of(drive, clips):
         if opt.rounds == 1:
-            return metrics.streamed(char, drive, clips, devices, opt.threads)
+            row = metrics.streamed(char, drive, clips, devices, opt.threads)
+            return row | (statue(char, [stream_of(char, c)[:2] for c in clips]) if devices == 3 else {})
         return counted(drive, clips)
 
     if opt.rounds > 1:

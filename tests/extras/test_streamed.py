@@ -4,11 +4,13 @@ import json
 import shutil
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
 import character
 import metrics
+import retarget
 from extras import streamed
 from headset.player import ride, stream_of
 from mocap import data
@@ -28,6 +30,22 @@ def test_captures(tmp_path):
     assert {c.name for c in streamed.captures_of(few, tmp_path, "select")} == names[0]  # chosen on no more than others
     for nowhere in (tmp_path, Path()):
         assert streamed.captures_of(streamed.Set("gone", "bandai"), nowhere, "report") == []
+
+
+def test_statue():
+    """Against MuJoCo's own forward kinematics of the standing pose, tick by tick; a user who hangs the arms is near."""
+    char = character.load("jesse")
+    pos, quat = streamed.motionless(char, 3)
+    moved = pos[:40] + np.linspace(0, 1, 40)[:, None, None] * [1.0, -0.5, 0.0]
+    streams, errors = [(pos[:20], quat[:20]), (moved, quat[:40])], []
+    data = mujoco.MjData(char.model)
+    for p, q in streams:
+        for place, turn in zip(p, q, strict=True):
+            data.qpos[:] = retarget.standing(char, place[:1], turn[:1])[0]
+            mujoco.mj_forward(char.model, data)
+            errors.append([np.linalg.norm(data.site_xpos[char.sensor_sites[k]] - place[k]) for k in (1, 2)])
+    found = streamed.statue(char, streams)["statue_cm"]
+    assert found == pytest.approx(100 * np.mean(errors), rel=1e-5) and 1.0 < found < 25.0
 
 
 def test_together():
@@ -142,6 +160,7 @@ def test_command(tmp_path, monkeypatch, capsys):
     policy, path, meta = metrics.find_policy(metrics.Options(character="dino"))
     char = character.load("dino")
     direct = metrics.streamed(char, policy.mean_action, streamed.captures_of(one, tmp_path, "select"))
+    assert 1.0 < walks.pop("statue_cm") < 100.0
     assert walks == pytest.approx(json.loads(metrics.as_json({"": direct}))[""])
     assert every["completed"] == walks["completed"] > limp["completed"] == 0.0
     assert still["clips"] == 1 and still["completed"] == 1.0
