@@ -510,6 +510,7 @@ def time_to_failure(char, ref, act, n=256, seconds=20.0, seed=0, threads=0) -> f
 
 # ------------------------------------------------------------------------------------ as a user plays it
 
+
 def streamed(char: Character, act, clips, devices=3, threads=0, sensors=None) -> dict:
     """The row `streamed` of REPRODUCE.md's metrics: driven by sensors alone, from the default pose, with a lead-in.
 
@@ -577,8 +578,8 @@ class Options(MotionFlags, Switches):
     )
     half: str = arg(
         "both",
-        "which captures of the row streamed; the other rows are of the whole part: select, every other one by name of "
-        "those that --clips leaves, on which policies are chosen; report, the rest; or both",
+        "captures of the row streamed: select, every other one by name of those that --clips leaves, to choose "
+        "policies on; report, the rest, to report; or both.  The other rows are of all",
         choices=tuple(HALVES),
     )
     rows: tuple[str, ...] = arg(ROWS, f"rows of the table, of {', '.join(ROWS)}", metavar="NAME,…")
@@ -679,6 +680,7 @@ def run(opt: Options) -> None:
 
 
 # ------------------------------------------------------------------------------------ comparing
+
 
 @dataclass
 class Arm:

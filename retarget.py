@@ -539,7 +539,7 @@ def write_bvh(path, char: Character, qpos, rate, names=OWN) -> None:
 class BvhFlags:
     """The flags of every command that writes BVH."""
 
-    bvh: str | None = arg(None, "write what the character does as BVH: a whole motion, up to ten minutes of a stream")
+    bvh: str | None = arg(None, "write the character's motion as BVH, whole; of a stream up to ten minutes")
     bvh_names: str = arg(
         OWN,
         "names of the BVH's joints: the character's own, or a standard's, with a T-pose as rest pose",

@@ -1,4 +1,4 @@
-r"""Training as the shipped policies were: a curriculum of starts, other users and devices  (ours, beyond the paper).
+r"""Training as the shipped policies began: a curriculum of starts, other users and devices  (ours, beyond the paper).
 
     python -m extras.train --character dino --motion FOLDER --out runs/a        by [training] in characters/dino.toml
     python -m extras.train --gpu --character jesse --motion FOLDER --envs 8192  on an NVIDIA GPU (extra gpu)
@@ -65,7 +65,9 @@ class Options(ppo.Options):
     balance: bool = arg(False, "start more often where episodes end soon, so that all motion is simulated equally long")
     retry: float = arg(0.0, "share of episodes that start up to 2 s before a place where one failed", check=UNIT)
     stand: float = arg(0.0, "share that start in the default pose under the headset, as a stream does", check=UNIT)
-    begin: float = arg(0.0, "share that start so under a user who stands still before a visit", check=UNIT)
+    begin: float = arg(
+        0.0, "share that start so under a user who stands, then sets off into a clip, and stands again", check=UNIT
+    )
     early: float = arg(
         0.0, "share that start in the first frames of recordings in motion, as `tracked` does", check=UNIT
     )
@@ -78,12 +80,18 @@ class Options(ppo.Options):
     sensor_offset: float = arg(0.0, "constant error of device positions in an episode [m]", check=NONNEGATIVE)
     sensor_noise: float = arg(0.0, "white noise on device positions [m]", check=NONNEGATIVE)
     push: float = arg(0.0, "largest random push, every 2 s on average [m/s]", check=NONNEGATIVE)
-    aid: float = arg(0.0, "a hand on the root where a sequence fails often: at most so much of it a step", check=UNIT)
+    aid: float = arg(
+        0.0,
+        "where a sequence fails often a hand leads the root: at most so much of its velocity's error goes a step",
+        check=UNIT,
+    )
     root_limit: float = arg(ROOT_LIMIT, "an episode ends as far from the root's target [§3.6: 0.30 m]", check=POSITIVE)
     near: float | None = arg(
-        None, "so far where nobody stood at the beginning; --root-limit by default [m]", check=POSITIVE
+        None, "--root-limit of sequences that begin in motion, if it is another [m]", check=POSITIVE
     )
-    root_lag: float = arg(0.0, "and as far again as the user went in so many seconds, of late", check=NONNEGATIVE)
+    root_lag: float = arg(
+        0.0, "seconds of the user's own speed of late that are added to it: who runs may be late", check=NONNEGATIVE
+    )
     episode: int = arg(EPISODE_STEPS, "control steps to truncation [§3.6]", check=POSITIVE)
     solver: str = arg("pgs", "of contacts: pgs, or newton, exact, as when playing", tuple(character.SOLVERS))
     gpu: bool = arg(False, "train on an NVIDIA GPU (extra gpu); give thousands of --envs")

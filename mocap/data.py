@@ -263,7 +263,8 @@ def load(motion="builtin", rate=CONTROL_RATE, clips="*", split="all", reading=AS
         found = sorted({part for _, part, _ in matching})
         raise UserError(
             f"{motion}: none of the {len(matching)} clips that match {clips!r} is in split {split!r}; "
-            f"they are in {' and '.join(found)} (--split)"
+            f"they are in {' and '.join(found)}; valid: --all or --split, a clip whose number ends in 5, or folders "
+            "called train and validation (mocap/README.md)"
         )
     if motion in BUILTIN:
         return chosen
