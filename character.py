@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -56,7 +57,7 @@ class Character:
     root: int  # body id
     head: int
     hip_height: float  # m, root above the soles in the default pose
-    chains: list  # (body, hinge indices, axes, from, to, shares) in tree order
+    chains: list  # of `Follower`, in tree order
     mapped: np.ndarray  # (j,) bool, hinges that follow the human
     obs_links: np.ndarray  # body ids
     reward_links: np.ndarray  # body ids
@@ -410,8 +411,22 @@ def joint_map(c):
     c.head = followers[SEG["head"]]
 
 
-def chain(c, b, said):
-    """What a body of the joint map does: (body, hinges, axes, from, to, shares)."""
+class Follower(NamedTuple):
+    """A body of the joint map: its hinges take the turn of the human's segment `end` relative to `start`.
+
+    shares : axis -> share of that turn about it; {} takes all that the bodies before it in the chain have left
+    """
+
+    body: int
+    hinges: np.ndarray  # indices into the joint angles
+    axes: str  # of the hinges, such as "yxz"
+    start: int  # segments of the human
+    end: int
+    shares: dict
+
+
+def chain(c, b, said) -> Follower:
+    """What a body of the joint map does."""
     m, name = c.model, c.model.body(b).name
     hinges = np.arange(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]) - 1
     if b == m.body_rootid[b] or not len(hinges):
@@ -420,7 +435,7 @@ def chain(c, b, said):
     shares = {a: said[a] for a in "xyz" if a in said}
     if odd := sorted({*shares} - {*axes}):
         raise UserError(f"[map] {name} shares {', '.join(odd)}; valid: what its hinges turn about, {', '.join(axes)}")
-    return b, hinges, axes, said["from"], said["to"], shares
+    return Follower(b, hinges, axes, said["from"], said["to"], shares)
 
 
 def feet(c):

@@ -165,7 +165,7 @@ def measure(char: Character, ref: Reference, recordings: list[Recording]) -> dic
               test_metrics_on_known_motion, test_nothing_to_measure, test_field_units_against_slow_loop
     """
     m, rate, pool = char.model, ref.rate, _Pool()
-    bodies = np.array(sorted({b for b, *_ in char.chains}))
+    bodies = np.array(sorted({f.body for f in char.chains}))
     joints = np.union1d(bodies, m.site_bodyid[char.sensor_sites])
     sip, apart, groups = sip_bodies(char), OwnShapes(char), driven_groups(char)
     segments, deepest, rows = shared_segments(char), [], []

@@ -23,6 +23,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import sys
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -504,6 +505,7 @@ def _write_pictures(char, ref, recording, last, opt):
 
 # ------------------------------------------------------------------------------------ many recordings
 
+FEW = 10  # recordings that are read without a word
 OF_FILE = ("seconds", "completed", "survival", "failures", "fails_every_s", "head_cm", "hands_cm", "own_slide_cm_s")
 
 
@@ -573,6 +575,8 @@ def play_recordings(char: Character, policy, path, devices: int, opt: Options) -
     Test      tests/headset/test_stream.py::test_folder_of_recordings"""
     check_fits(policy, Player(char, policy.mean_action, devices=devices), path)
     read, found = 1 if opt.sensors == "hmd" else devices, recordings_of(opt.stream)
+    if len(found) > FEW:
+        print(f"reading {len(found)} recordings, to play them side by side", file=sys.stderr)
     taken, broken = sound(lambda file: (file, ticks_of(char, file, read, opt)), found)
     files, streams = zip(*taken, strict=True)
     top, many = Path(opt.stream), os.path.isdir(opt.stream)

@@ -280,10 +280,10 @@ def retarget(char: Character, clip: Clip) -> Pose:
     """
     n, m = len(clip), char.model
     q = np.tile(char.default, (n, 1))
-    chains = {}  # (from, to) -> what the chain's bodies have turned so far, from the default pose
-    for body, hinges, axes, a, b, shares in char.chains:
-        turn = quat_mul(quat_conj(clip.quat[:, a]), clip.quat[:, b])
-        done = chains.get((a, b), np.tile([1.0, 0, 0, 0], (n, 1)))
+    turned = {}  # (start, end) -> what the chain's bodies have turned so far, from the default pose
+    for body, hinges, axes, start, end, shares in char.chains:
+        turn = quat_mul(quat_conj(clip.quat[:, start]), clip.quat[:, end])
+        done = turned.get((start, end), np.tile([1.0, 0, 0, 0], (n, 1)))
         local = quat_mul(char.rest[m.body_parentid[body]], m.body_quat[body])  # the body, were its hinges at 0
         sign = m.jnt_axis[1 + hinges][np.arange(len(hinges)), ["xyz".index(x) for x in axes]]
         if shares:
@@ -296,7 +296,7 @@ def retarget(char: Character, clip: Clip) -> Pose:
             angles = euler_angles(quat_mul(quat_conj(local), wanted), axes, *allowed)
         for k, axis in enumerate(axes):
             local = quat_mul(local, quat_about("xyz".index(axis), angles[:, k]))
-        chains[a, b] = quat_mul(done, quat_mul(local, quat_conj(char.rest[body])))
+        turned[start, end] = quat_mul(done, quat_mul(local, quat_conj(char.rest[body])))
         q[:, hinges] = angles * sign
     inside = np.clip(q, char.ranges[:, 0], char.ranges[:, 1])
     root_pos = clip.pos[:, 0] * root_scale(char, clip.hip_height)
@@ -327,7 +327,7 @@ def shared_segments(char: Character) -> dict[int, int]:
     Test      tests/test_retarget.py::test_as_human
     """
     found = {SEG["pelvis"]: char.root}
-    found |= {to: body for body, _, _, _, to, shares in char.chains if not shares}
+    found |= {f.end: f.body for f in char.chains if not f.shares}
     for name, site in zip(SENSORS[1:], char.sensor_sites[1:], strict=True):
         body = int(char.model.site_bodyid[site])
         if body not in found.values():

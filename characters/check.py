@@ -207,7 +207,7 @@ def summary(char: Character) -> str:
         "hinge           limit N m  spring N m/rad  range rad      weight  follows",
     ]
     limits = dict(zip(char.driven, char.limits, strict=True))
-    follows = {h: SEGMENTS[c[4]] for c in char.chains for h in c[1]}
+    follows = {h: SEGMENTS[f.end] for f in char.chains for h in f.hinges}
     weight = char.joint_weights / max(char.joint_weights.max(), 1e-9)
     for h, name in enumerate(char.hinges):
         if mirrored(name) not in char.hinges[:h]:

@@ -44,8 +44,8 @@ def bones(char) -> dict[int, str]:
     Test      tests/mocap/test_humanoid.py::test_names, test_a_character_of_ones_own
     """
     of = {}  # segment -> bodies that follow it, in tree order
-    for body, _, _, _, to, _ in char.chains:
-        of.setdefault(to, []).append(body)
+    for follower in char.chains:
+        of.setdefault(follower.end, []).append(follower.body)
     trunk, neck = of.get(SEG["chest"], []), of.get(SEG["head"], [])
     out = {char.root: "Hips"}
     out |= dict(zip(trunk[:2] + trunk[2:][-1:], ("Spine", "Chest", "UpperChest")))
