@@ -327,7 +327,7 @@ def sound(read, items) -> tuple[list, list[str]]:
         except UserError as error:
             broken.append(str(error))
     if broken and not out:
-        raise UserError(broken[0])
+        raise UserError(broken[0] + (f"; nor can {len(broken) - 1} others be used" if len(broken) > 1 else ""))
     return out, broken
 
 

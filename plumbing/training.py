@@ -61,8 +61,8 @@ def with_a_note(opt):
     char = opt.load()
     odd = [
         f"{k} {shown(getattr(opt, k))} (recipe: {shown(v)})"
-        for k, v in (char.training.items() if opt.recipe != "none" and not opt.init else ())
-        if hasattr(opt, k) and shown(getattr(opt, k)) != shown(v)
+        for k, v in (char.training.items() if opt.recipe != "none" else ())
+        if hasattr(opt, k) and not (opt.init and k in ("hidden", "value_hidden")) and shown(getattr(opt, k)) != shown(v)
     ]
     if odd:
         print(f"goes on as it began, not by today's [training] of {char.path.name}: {', '.join(odd)}")
@@ -178,9 +178,30 @@ def tables_of(char) -> dict:
     return {name: table for name, table in char.spec.items() if name not in ("training", "metrics")}
 
 
-SOLID = (  # of the compiled model: what the physics of a run hangs on
-    *("body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "geom_size", "geom_pos", "geom_friction"),
-    *("geom_solref", "geom_solimp", "jnt_pos", "jnt_axis", "jnt_range", "dof_armature", "dof_damping", "actuator_gear"),
+SOLID = (  # arrays of the compiled model on which the physics of a run hangs, and what is seen and counted of it
+    *(
+        "body_mass",
+        "body_inertia",
+        "body_pos",
+        "body_quat",
+        "body_ipos",
+        "geom_type",
+        "geom_size",
+        "geom_pos",
+        "geom_quat",
+    ),
+    *(
+        "geom_contype",
+        "geom_conaffinity",
+        "geom_friction",
+        "geom_solref",
+        "geom_solimp",
+        "jnt_pos",
+        "jnt_axis",
+        "jnt_range",
+    ),
+    *("jnt_stiffness", "dof_armature", "dof_damping", "dof_frictionloss", "qpos_spring", "actuator_gear", "site_pos"),
+    "site_quat",
 )
 
 
@@ -189,30 +210,28 @@ def model_of(char) -> dict:
 
     Why       its XML can be edited between two launches as its TOML can
     Test      tests/test_ppo.py::test_resume_refuses_other_tables"""
-    return {name: fingerprint(getattr(char.model, name)) for name in SOLID}
+    option = {"gravity": char.model.opt.gravity, "cone": [char.model.opt.cone]}
+    return {name: fingerprint(a) for name, a in ({n: getattr(char.model, n) for n in SOLID} | option).items()}
 
 
 def check_same(seen, now, out):
     """UserError unless a run that is resumed sees the motions, and the character's tables and model, that it saw.
 
     Test      tests/test_ppo.py::test_resume_refuses_other_options, test_resume_refuses_other_tables"""
-    if not isinstance(seen, dict) or seen.get("fingerprint") != now["fingerprint"]:
-        told = [
-            {k: v for k, v in a.items() if k not in ("tables", "model")} if isinstance(a, dict) else a
-            for a in (seen, now)
-        ]
-        changed = f"the motions have changed since the run began ({told[0]} against {told[1]})"
-        raise UserError(f"{out}: {changed}; start a new run with --init {out}")
-    tables = now.get("tables", {})
-    before = seen["tables"] if isinstance(seen.get("tables"), dict) else tables  # runs of before 2026-12 kept none
+    tables, model = now.get("tables", {}), now.get("model", {})
+    kept = seen if isinstance(seen, dict) else {}
+    before = kept["tables"] if isinstance(kept.get("tables"), dict) else tables  # runs of before 2026-12 kept none
     if odd := [f"[{name}]" for name in sorted({*before, *tables}) if before.get(name) != tables.get(name)]:
         was = f"{', '.join(odd)} of the character's TOML changed since the run began"
         raise UserError(f"{out}: {was}; put it back, as {CONFIG} has it, or start a new run with --init {out}")
-    model = now.get("model", {})
-    before = seen["model"] if isinstance(seen.get("model"), dict) else model  # likewise
+    before = kept["model"] if isinstance(kept.get("model"), dict) else model  # likewise
     if odd := [name for name in model if before.get(name) != model[name]]:
         was = f"{', '.join(odd)} of the character's model (its XML, or the flags) changed since the run began"
         raise UserError(f"{out}: {was}; put it back, or start a new run with --init {out}")
+    if kept.get("fingerprint") != now["fingerprint"]:  # last: another pose makes other motions of the same files
+        had, has = (f"{a.get('sequences')} sequences, {str(a.get('minutes'))[:6]} min" for a in (kept, now))
+        changed = f"the motions have changed since the run began ({had} then, {has} now)"
+        raise UserError(f"{out}: {changed}; start a new run with --init {out}")
 
 
 def progress_line(stats) -> dict:

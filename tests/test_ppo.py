@@ -571,6 +571,8 @@ def test_resume_refuses_other_tables(tmp_path, capsys):
     for pattern, other, name in (
         (r"mass=\"13\"", 'mass="14"', "body_mass"),
         (r"friction=\"[\d. ]+\"", 'friction="0.2"', "geom_friction"),
+        (r"(<site name=\"headset\" pos=\")[\d.]+", r"\g<1>0.5", "site_pos"),
+        (r"<worldbody>", '<option gravity="0 0 -1.62"/><worldbody>', "gravity"),
     ):
         changed = re.sub(pattern, other, body, count=1)
         assert changed != body
@@ -587,6 +589,8 @@ def test_resume_refuses_other_tables(tmp_path, capsys):
     training.with_a_note(Options(character=str(own), lr=5e-5))
     assert "not by today's [training] of mine.toml: " in (told := capsys.readouterr().out)
     assert "lr 5e-05 (recipe: 1e-06)" in told
+    training.with_a_note(Options(character=str(own), lr=5e-5, init="x", hidden=(7,)))  # its widths are --init's
+    assert "lr 5e-05 (recipe: 1e-06)" in (told := capsys.readouterr().out) and "hidden" not in told
 
 
 def test_resume_accepts_what_changes_nothing(whole, tmp_path):

@@ -381,7 +381,7 @@ def test_remarks(jesse, walk, tmp_path):
     relative[:, 1:] -= pos[:, :1]
     for given, end, said in (
         (pos, "\n", []),
-        (low, "\n", ["over its place in the first second"]),
+        (low, "\n", ["no floor at 0: taken 1.64 m below", "over its place in the first second"]),
         (relative, "\n", ["not relative to the headset"]),
         (pos, "", ["its last line is cut short: left out"]),
     ):
