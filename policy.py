@@ -217,6 +217,18 @@ def initial(path, opt, env) -> tuple[Policy, int]:
     return policy, total_steps(meta)
 
 
+def shown_ahead(meta) -> dict:
+    """λ and μ of `extras.policies.led` as a policy's file says, those that are not 0: {"lead": …, "damping": …}.
+
+    Test      tests/extras/test_policies.py::test_led_by_command"""
+    return {k: v for k in ("lead", "damping") if isinstance(v := meta.get(k), (int, float)) and v}
+
+
+def flags_of(options) -> str:
+    """{"lead": 0.08} -> "--lead 0.08".  Test: tests/extras/test_policies.py::test_join_command"""
+    return " ".join(f"--{k} {v:g}" for k, v in options.items())
+
+
 LEARNT = ("gamma", "root_limit", "root_lag", "near", "sigma", "min_sigma")  # options that --init does not bring
 
 
@@ -226,17 +238,19 @@ def trained_otherwise(meta, opt) -> list[str]:
     Args      meta : of the policy's file; opt : of the run
     Test      tests/test_ppo.py::test_init_says_what_differs"""
     before, flags = meta.get("options"), []
-    before, now = before if isinstance(before, dict) else {}, getattr(opt, "set", None) or ""
+    before = before if isinstance(before, dict) else {}
     for name in LEARNT:
         if hasattr(opt, name) and before.get(name) not in (None, getattr(opt, name)):
             flags.append(f"--{name.replace('_', '-')} {before[name]}")
-    rewards = meta.get("reward") or [part.strip() for part in (before.get("set") or "").split(";") if part.strip()]
-    tight = lambda text: "".join(str(text).split())  # noqa: E731
-    if odd := [r for r in rewards if tight(r) not in tight(now).split(";")]:
+    tight = lambda change: "".join(str(change).split())  # noqa: E731
+    asked = {tight(change) for part in parted(getattr(opt, "set", None)) for change in part}
+    changes = meta.get("reward") or sum(parted(before.get("set")), [])
+    if odd := [change for change in changes if tight(change) not in asked]:
         flags.append(f'--set "{"; ".join(map(str, odd))}"')
     notes = [f"was trained with {' '.join(flags)}, which this run has not"] if flags else []
-    if ahead := " ".join(f"--{k} {-meta[k]:g}" for k in ("lead", "damping") if isinstance(meta.get(k), float)):
-        notes.append(f"is shown the user ahead, which a run unlearns: python -m extras.policies ship IN OUT {ahead}")
+    if ahead := {k: -v for k, v in shown_ahead(meta).items()}:
+        back = f"python -m extras.policies ship IN OUT {flags_of(ahead)}"
+        notes.append(f"is shown the user ahead, which a run unlearns: {back}")
     return notes
 
 

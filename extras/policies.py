@@ -38,7 +38,17 @@ from nn import LEAKY_SLOPE, MLP, RunningNorm
 from plumbing.cli import ALL_POSITIVE, POSITIVE, UNIT, UserError, arg, cli, given_flags, run_main, some_of, words_first
 from plumbing.files import check_folders
 from plumbing.runs import fmt_count, git_state, save_checkpoint, versions
-from policy import Policy, devices_of, load_policy, parted, sensors_of, total_steps, trained_as
+from policy import (
+    Policy,
+    devices_of,
+    flags_of,
+    load_policy,
+    parted,
+    sensors_of,
+    shown_ahead,
+    total_steps,
+    trained_as,
+)
 
 GATE = dict(width=0.1, depth=10.0, scale=3.0)  # of `gated`: m/s; how far units are put off; a unit's size.  ASSUMED
 RUN_WIDTH = 0.4  # m/s, of the gate to an expert of runs: a runner's speed swings in every step.  ASSUMED
@@ -105,18 +115,6 @@ def led(policy: Policy, char: Character, devices=3, *, lead=0.0, damping=0.0) ->
             w["W0"][k] += metres * answer / inverse[k]
             w["b0"][:] += metres * answer * mean[k]
     return policy
-
-
-def shown_ahead(meta) -> dict:
-    """λ and μ of `led` as a policy's file says, those that are not 0: {"lead": …, "damping": …}.
-
-    Test      tests/extras/test_policies.py::test_led_by_command"""
-    return {k: meta[k] for k in ("lead", "damping") if meta.get(k)}
-
-
-def flags_of(options) -> str:
-    """{"lead": 0.08} -> "--lead 0.08".  Test: tests/extras/test_policies.py::test_join_command"""
-    return " ".join(f"--{k} {v:g}" for k, v in options.items())
 
 
 def _body(meta, path) -> tuple:

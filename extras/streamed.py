@@ -77,16 +77,14 @@ TRAINED = (  # what is hard of the training sets: there is more of it than is he
 )
 ROUNDS = (lambda v: 1 <= v <= 100, "from 1 to 100")
 MINUTE = 62.0  # s of the user who does not move, of which the first second calibrates
-COLUMNS = (
+COLUMNS = [
     ("clips", "captures", "{:d}"),
     *(c for c in metrics.COLUMNS if c[0] in (
         "completed", "within_1m", "survival", "fails_every_s", "first_failure_s", "root_cm", "head_cm", "hands_cm",
         "foot_slide_cm_s", "own_slide_cm_s", "contact_agreement", "self_penetration_mm", "spring_share",
     )),
-)  # fmt: skip
-COLUMNS = tuple(
-    d for c in COLUMNS for d in ([c, ("statue_cm", "hands of a statue cm", "{:.1f}")] if c[0] == "hands_cm" else [c])
-)
+]  # fmt: skip
+COLUMNS.insert([c[0] for c in COLUMNS].index("hands_cm") + 1, ("statue_cm", "hands of a statue cm", "{:.1f}"))
 OF_ROUNDS = [c for c in COLUMNS if c[0] not in (
     "within_1m", "root_cm", "foot_slide_cm_s", "contact_agreement", "self_penetration_mm", "spring_share",
 )]  # fmt: skip
@@ -205,13 +203,15 @@ def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, d
 
     def counted(drive, several):
         row = row_of_streams(char, drive, several, devices, opt.threads)
-        return row | {"clips": row["captures"]} | (statue(char, several) if devices == 3 else {})
+        return row | {"clips": row["captures"]}
 
     def row_of(drive, clips):
         if opt.rounds == 1:
-            row = metrics.streamed(char, drive, clips, devices, opt.threads)
-            return row | (statue(char, [stream_of(char, c)[:2] for c in clips]) if devices == 3 else {})
+            return metrics.streamed(char, drive, clips, devices, opt.threads)
         return counted(drive, clips)
+
+    def beside(several):  # the baseline of the hands
+        return statue(char, several) if devices == 3 else {}
 
     if opt.rounds > 1:
         made = {name: [stream_of(char, clip, devices)[:2] for clip in clips] for name, clips in captures.items()}
@@ -221,11 +221,12 @@ def rows_of(char: Character, act, captures: dict, streams: dict, opt: Options, d
         for name, clips in captures.items():
             rows.append(row_of(drive, clips))
             if drive is act:
-                yield name, rows[-1]
+                several = clips if opt.rounds > 1 else [stream_of(char, clip)[:2] for clip in clips]
+                yield name, rows[-1] | beside(several)
         if rows:
             yield title, together(rows)
     for name, several in streams.items():
-        yield name, counted(act, several)
+        yield name, counted(act, several) | beside(several)
 
 
 def main(argv=None) -> int:

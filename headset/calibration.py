@@ -175,6 +175,11 @@ class Stream:
         why = f"; of them {', '.join(bad)}" if bad else ""
         return f"{self.rows} rows show the headset for {self.tracked():.2f} s; {need}{why}"
 
+    @property
+    def guessed(self) -> bool:
+        """Whether the floor is neither the stream's nor told.  Test: tests/headset/test_stream.py::test_remarks"""
+        return self.calibration.estimated and not self.user_height
+
     def remarks(self) -> list[str]:
         """What is to be said of the rows' times, of a user who crouched while calibrating, of controllers elsewhere.
 
@@ -203,7 +208,7 @@ class Stream:
         Test      tests/headset/test_stream.py::test_real_recordings"""
         lines = []
         if c := self.calibration:
-            how = "guessed" if c.estimated and not self.user_height else "as told" if c.estimated else "the stream's"
+            how = "guessed" if self.guessed else "as told" if c.estimated else "the stream's"
             lines.append(
                 f"user's headset {c.height:.2f} m above the floor; floor at {c.floor:.2f} m ({how}); "
                 f"forward {np.degrees(c.yaw):.0f} degrees; heights times {c.scale[2]:.3f}"

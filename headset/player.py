@@ -344,11 +344,11 @@ def ticks_of(char: Character, path, devices: int, opt: axes.StreamFlags):
     if not ticks:
         raise UserError(f"{path}: {source.uncalibrated()}")
     cut, c = ["its last line is cut short: left out"] if reader.unreadable else [], source.calibration
-    floor = [f"no floor at 0: taken {c.height:g} m below the headset, at {c.floor:.2f} m (--user-height)"]
+    where = f"no floor at 0: taken {c.height:g} m below the headset, at {c.floor:.2f} m (--user-height)"
     told = {
         "axes": how.axes,
         "grip": GRIP[how.axes] if how.grip is None else how.grip,
-        "notes": [*how.told, *(floor if c.estimated and not opt.user_height else []), *source.remarks(), *cut],
+        "notes": [*how.told, *([where] if source.guessed else []), *source.remarks(), *cut],
         "lost_s": {device: round(s - before[device], 3) for device, s in source.guard.lost().items()},
     }
     return np.stack([t.pos for t in ticks[:last]]), np.stack([t.quat for t in ticks[:last]]), told

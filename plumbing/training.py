@@ -179,30 +179,10 @@ def tables_of(char) -> dict:
 
 
 SOLID = (  # arrays of the compiled model on which the physics of a run hangs, and what is seen and counted of it
-    *(
-        "body_mass",
-        "body_inertia",
-        "body_pos",
-        "body_quat",
-        "body_ipos",
-        "geom_type",
-        "geom_size",
-        "geom_pos",
-        "geom_quat",
-    ),
-    *(
-        "geom_contype",
-        "geom_conaffinity",
-        "geom_friction",
-        "geom_solref",
-        "geom_solimp",
-        "jnt_pos",
-        "jnt_axis",
-        "jnt_range",
-    ),
-    *("jnt_stiffness", "dof_armature", "dof_damping", "dof_frictionloss", "qpos_spring", "actuator_gear", "site_pos"),
-    "site_quat",
-)
+    "body_mass body_inertia body_pos body_quat body_ipos geom_type geom_size geom_pos geom_quat geom_contype "
+    "geom_conaffinity geom_friction geom_solref geom_solimp jnt_pos jnt_axis jnt_range jnt_stiffness dof_armature "
+    "dof_damping dof_frictionloss qpos_spring actuator_gear site_pos site_quat"
+).split()
 
 
 def model_of(char) -> dict:
@@ -214,18 +194,24 @@ def model_of(char) -> dict:
     return {name: fingerprint(a) for name, a in ({n: getattr(char.model, n) for n in SOLID} | option).items()}
 
 
+def differing(before, now: dict) -> list[str]:
+    """Names under which two dicts differ; none where `before` is not one, for runs of before 2026-12 kept none.
+
+    Test      tests/test_ppo.py::test_resume_refuses_other_tables"""
+    if not isinstance(before, dict):
+        return []
+    return [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
+
+
 def check_same(seen, now, out):
     """UserError unless a run that is resumed sees the motions, and the character's tables and model, that it saw.
 
     Test      tests/test_ppo.py::test_resume_refuses_other_options, test_resume_refuses_other_tables"""
-    tables, model = now.get("tables", {}), now.get("model", {})
     kept = seen if isinstance(seen, dict) else {}
-    before = kept["tables"] if isinstance(kept.get("tables"), dict) else tables  # runs of before 2026-12 kept none
-    if odd := [f"[{name}]" for name in sorted({*before, *tables}) if before.get(name) != tables.get(name)]:
-        was = f"{', '.join(odd)} of the character's TOML changed since the run began"
+    if odd := differing(kept.get("tables"), now.get("tables", {})):
+        was = f"{', '.join(f'[{name}]' for name in odd)} of the character's TOML changed since the run began"
         raise UserError(f"{out}: {was}; put it back, as {CONFIG} has it, or start a new run with --init {out}")
-    before = kept["model"] if isinstance(kept.get("model"), dict) else model  # likewise
-    if odd := [name for name in model if before.get(name) != model[name]]:
+    if odd := differing(kept.get("model"), now.get("model", {})):
         was = f"{', '.join(odd)} of the character's model (its XML, or the flags) changed since the run began"
         raise UserError(f"{out}: {was}; put it back, or start a new run with --init {out}")
     if kept.get("fingerprint") != now["fingerprint"]:  # last: another pose makes other motions of the same files
